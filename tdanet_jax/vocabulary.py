@@ -1,0 +1,138 @@
+"""Room types, actions, target classes and zero-shot splits: the words of the task.
+
+Sources: actions, rooms, targets and splits as in MJOLNIR (Qiu et al. 2020), SSNet (Zhao et al.
+2023) and TDANet (Lian and Zhang 2024).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from enum import IntEnum
+
+
+class Action(IntEnum):
+    """The six actions, in the order of the policy's outputs."""
+
+    MOVE_AHEAD = 0
+    ROTATE_LEFT = 1
+    ROTATE_RIGHT = 2
+    LOOK_UP = 3
+    LOOK_DOWN = 4
+    DONE = 5
+
+
+ACTION_NAMES = ("MoveAhead", "RotateLeft", "RotateRight", "LookUp", "LookDown", "Done")
+NUM_ACTIONS = len(ACTION_NAMES)
+
+ROOM_TYPES = ("kitchen", "living_room", "bedroom", "bathroom")
+
+#: Scene numbers of each room type, in AI2-THOR's numbering; the first 20 train, the last 10 test.
+SCENE_NUMBERS = {
+    "kitchen": range(1, 31),
+    "living_room": range(201, 231),
+    "bedroom": range(301, 331),
+    "bathroom": range(401, 431),
+}
+TRAIN_SCENES_PER_TYPE = 20
+#: `--validation` trains on the first 16 training rooms of a type and evaluates on the last 4.
+VALIDATION_TRAIN_SCENES_PER_TYPE = 16
+
+#: The 22 target classes by room type.
+TARGETS: dict[str, tuple[str, ...]] = {
+    "kitchen": ("Toaster", "Spatula", "Bread", "Mug", "CoffeeMachine", "Apple"),
+    "living_room": ("Painting", "Laptop", "Television", "RemoteControl", "Vase", "ArmChair"),
+    "bedroom": ("Blinds", "DeskLamp", "Pillow", "AlarmClock", "CD"),
+    "bathroom": ("Mirror", "ToiletPaper", "SoapBar", "Towel", "SprayBottle"),
+}
+ALL_TARGETS = tuple(name for room in ROOM_TYPES for name in TARGETS[room])
+
+#: Classes that are never a target in training, by split (seen/unseen) and room type.
+UNSEEN: dict[str, dict[str, tuple[str, ...]]] = {
+    "22/0": {room: () for room in ROOM_TYPES},
+    "18/4": {
+        "kitchen": ("Toaster",),
+        "living_room": ("Laptop",),
+        "bedroom": ("Pillow",),
+        "bathroom": ("ToiletPaper",),
+    },
+    "14/8": {
+        "kitchen": ("Apple", "Toaster"),
+        "living_room": ("Television", "Laptop"),
+        "bedroom": ("AlarmClock", "Pillow"),
+        "bathroom": ("ToiletPaper", "Mirror"),
+    },
+}
+#: One more seen class per room type, held out by `--validation` to stand for the unseen ones.
+VALIDATION_UNSEEN = {
+    "kitchen": ("Bread",),
+    "living_room": ("RemoteControl",),
+    "bedroom": ("DeskLamp",),
+    "bathroom": ("SoapBar",),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Split:
+    """Which rooms and target classes train, and which are evaluated as seen and as unseen.
+
+    Attributes:
+      name: "18/4", or "18/4-validation".
+      train_scenes, eval_scenes: scene names such as "FloorPlan1".
+      hidden: classes of which nothing reaches the learner.
+      seen: room type -> target classes that train.
+      unseen: room type -> target classes evaluated as never trained on; a subset of `hidden`.
+    """
+
+    name: str
+    train_scenes: tuple[str, ...]
+    eval_scenes: tuple[str, ...]
+    hidden: frozenset[str]
+    seen: dict[str, tuple[str, ...]]
+    unseen: dict[str, tuple[str, ...]]
+
+
+def scene_name(number: int) -> str:
+    """AI2-THOR's name of a scene: FloorPlan228."""
+    return f"FloorPlan{number}"
+
+
+def make_split(name: str, validation: bool = False) -> Split:
+    """The split called `name` ("22/0", "18/4" or "14/8").
+
+    With `validation`, the test rooms and the unseen classes are not touched: the last 4 training
+    rooms of each type are evaluated, and one seen class per type is held out beside the unseen.
+
+    Raises:
+      ValueError: `name` is no split.
+    """
+    if name not in UNSEEN:
+        raise ValueError(f"split {name!r} is not one of {', '.join(UNSEEN)}")
+    first = VALIDATION_TRAIN_SCENES_PER_TYPE if validation else TRAIN_SCENES_PER_TYPE
+    last = TRAIN_SCENES_PER_TYPE if validation else None
+    train, evaluated = [], []
+    for room in ROOM_TYPES:
+        names = [scene_name(n) for n in SCENE_NUMBERS[room]]
+        train += names[:first]
+        evaluated += names[first:last]
+    unseen = VALIDATION_UNSEEN if validation else UNSEEN[name]
+    hidden = {c for room in ROOM_TYPES for c in (*UNSEEN[name][room], *unseen[room])}
+    seen = {room: tuple(c for c in TARGETS[room] if c not in hidden) for room in ROOM_TYPES}
+    return Split(
+        name=f"{name}-validation" if validation else name,
+        train_scenes=tuple(train),
+        eval_scenes=tuple(evaluated),
+        hidden=frozenset(hidden),
+        seen=seen,
+        unseen=dict(unseen),
+    )
+
+
+def class_words(name: str) -> tuple[str, ...]:
+    """The lower-case words of a class name or label: "CoffeeMachine" -> ("coffee", "machine").
+
+    A run of capitals is one word ("CD", "TVStand" -> tv, stand); spaces, underscores and hyphens
+    separate as well.
+    """
+    pattern = r"[A-Z]+(?![a-z])|[A-Z][a-z]+|[a-z]+|[0-9]+"
+    return tuple(word.lower() for word in re.findall(pattern, name))
