@@ -1,0 +1,184 @@
+"""The 120 iTHOR rooms, from published metadata to one compact file and back.
+
+Two packages of the Python registry describe the rooms: `procthor` holds AI2-THOR's own object
+metadata of one default frame per room, `alfworld` the reachable points of the 0.25 m grid.
+`build_asset` joins them into `ithor.npz`; `load_scenes` reads that file. The agent's place in a
+default frame is not written down in the metadata: it follows from the distances to all objects.
+"""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tdanet_jax import assets
+from tdanet_jax.scenes import archive
+from tdanet_jax.scenes.errors import SceneError
+from tdanet_jax.scenes.geometry import frustum_rotation
+from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, GRID, Scene, SceneObject
+from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
+
+ASSET = "ithor.npz"
+UNIT = 1e-4  # metres; the file holds whole numbers of tenths of a millimetre
+METADATA = "procthor/databases/ai2thor-object-metadata.json"
+LAYOUT = "alfworld/gen/layouts/{name}-layout.npy"
+IGNORED = "Floor"  # neither hides nor is looked for; its box spans the room
+
+
+def box_of(record: dict[str, Any]) -> np.ndarray:
+    """Least and greatest corner [2, 3] of a metadata record's axis-aligned box, metres."""
+    box = record["axisAlignedBoundingBox"]
+    center = np.array([box["center"][axis] for axis in "xyz"])
+    half = np.array([box["size"][axis] for axis in "xyz"]) / 2
+    return np.stack([center - half, center + half])
+
+
+def locate_agent(records: list[dict[str, Any]]) -> np.ndarray:
+    """The agent's position [3] from its `distance` to every object of a frame, metres.
+
+    Differences of squared distances are linear in the position; a few Newton steps on the
+    distances themselves then remove what rounding left.
+    """
+    places = np.array([[r["position"][axis] for axis in "xyz"] for r in records])
+    distances = np.array([r["distance"] for r in records])
+    squares = (places**2).sum(axis=1) - distances**2
+    matrix = 2 * (places - places.mean(axis=0))
+    agent = np.linalg.lstsq(matrix, squares - squares.mean(), rcond=None)[0]
+    for _ in range(10):
+        offset = agent - places
+        lengths = np.linalg.norm(offset, axis=1)
+        agent = (
+            agent - np.linalg.lstsq(offset / lengths[:, None], lengths - distances, rcond=None)[0]
+        )
+    worst = np.abs(np.linalg.norm(agent - places, axis=1) - distances).max()
+    if worst > 1e-3:
+        raise SceneError(f"distances of a default frame contradict each other by {worst:.4f} m")
+    return agent
+
+
+def build_asset(procthor_wheel: Path, alfworld_wheel: Path, out_dir: Path) -> Path:
+    """Write `ithor.npz` into `out_dir` from the two wheels; equal wheels give equal bytes."""
+    with zipfile.ZipFile(procthor_wheel) as wheel:
+        metadata = json.loads(wheel.read(METADATA))
+    rooms: list[dict[str, Any]] = []
+    with zipfile.ZipFile(alfworld_wheel) as wheel:
+        for room_type, room in enumerate(ROOM_TYPES):
+            for offset, number in enumerate(SCENE_NUMBERS[room]):
+                name = f"FloorPlan{number}"
+                layout = np.load(
+                    io.BytesIO(wheel.read(LAYOUT.format(name=name))), allow_pickle=False
+                )
+                rooms.append(_room_arrays(name, room_type, metadata[f"{room}s"][offset], layout))
+    scene_keys = ("name", "room_type", "default_position", "default_rotation")
+    arrays = {f"scene_{key}": np.array([room[key] for room in rooms]) for key in scene_keys}
+    for key in rooms[0]:
+        if key not in scene_keys:
+            arrays[key] = np.concatenate([room[key] for room in rooms])
+    names, arrays["object_class"] = np.unique(arrays["object_class"], return_inverse=True)
+    arrays["object_class"] = arrays["object_class"].astype(np.int16)
+    arrays["class_name"] = names
+    has_corners = arrays["object_corners"] >= 0
+    arrays["object_corners"][has_corners] = np.arange(has_corners.sum())
+    arrays["scene_points"] = np.array([len(room["point"]) for room in rooms], np.int32)
+    arrays["scene_objects"] = np.array([len(room["object_id"]) for room in rooms], np.int32)
+    path = out_dir / ASSET
+    archive.write(path, arrays)
+    return path
+
+
+def _whole(lengths: Any) -> np.ndarray:
+    return np.rint(np.asarray(lengths, np.float64) / UNIT).astype(np.int32)
+
+
+def _room_arrays(
+    name: str, room_type: int, records: list[dict[str, Any]], layout: np.ndarray
+) -> dict[str, Any]:
+    """One room as arrays of whole numbers; objects sorted by (class, id)."""
+    agent = locate_agent(records)
+    grid = np.rint(layout / GRID) * GRID
+    if len(grid) == 0 or np.abs(grid - layout).max() > 1e-3:
+        raise SceneError(f"{name}: reachable points are not on a {GRID} m grid")
+    grid = np.unique(grid, axis=0)  # sorted by (x, z)
+    points = np.stack([grid[:, 0], np.full(len(grid), agent[1]), grid[:, 1]], axis=1)
+    kept = sorted(
+        (r for r in records if r["objectType"] != IGNORED),
+        key=lambda r: (r["objectType"], r["objectId"]),
+    )
+    boxes = np.array([box_of(r) for r in kept])
+    oriented = [i for i, r in enumerate(kept) if r["objectOrientedBoundingBox"]]
+    corners = [kept[i]["objectOrientedBoundingBox"]["cornerPoints"] for i in oriented]
+    corner_index = np.full(len(kept), -1, np.int16)
+    corner_index[oriented] = np.arange(len(oriented))
+    visible = np.array([r["visible"] for r in kept])
+    row = {r["objectId"]: i for i, r in enumerate(kept)}
+    parents = [sorted(row[p] for p in r["parentReceptacles"] or () if p in row) for r in kept]
+    return {
+        "name": name.encode(),
+        "room_type": np.int8(room_type),
+        "default_position": _whole(agent),
+        "default_rotation": np.int16(
+            frustum_rotation(boxes, visible, agent + (0.0, CAMERA_ABOVE_AGENT, 0.0))
+        ),
+        "point": _whole(points),
+        "object_id": np.array([r["objectId"].encode() for r in kept]),
+        "object_class": np.array([r["objectType"].encode() for r in kept]),
+        "object_box": _whole(boxes),
+        "object_corners": corner_index,
+        "corners": _whole(corners).reshape(-1, 8, 3),
+        "object_rotation": np.rint(
+            [[r["rotation"][axis] * 1000 for axis in "xyz"] for r in kept]
+        ).astype(np.int32),  # thousandths of a degree
+        "object_openable": np.array([r["openable"] for r in kept]),
+        "object_is_open": np.array([r["isOpen"] for r in kept]),
+        "object_pickupable": np.array([r["pickupable"] for r in kept]),
+        "object_visible": visible,
+        "object_parents": np.array([len(held) for held in parents], np.int16),
+        "parent": np.array([index for held in parents for index in held], np.int16),
+    }
+
+
+def load_scenes(path: Path | None = None) -> list[Scene]:
+    """The bundled rooms, in the order FloorPlan1-30, 201-230, 301-330, 401-430."""
+    data = archive.read(path or assets.path(ASSET))
+    points = np.split(data["point"] * UNIT, np.cumsum(data["scene_points"])[:-1])
+    parents = np.split(data["parent"], np.cumsum(data["object_parents"])[:-1])
+    ids = [value.decode() for value in data["object_id"]]
+    scenes = []
+    start = 0
+    for i, name in enumerate(data["scene_name"]):
+        stop = start + int(data["scene_objects"][i])
+        scenes.append(
+            Scene(
+                name=name.decode(),
+                room_type=int(data["scene_room_type"][i]),
+                points=points[i],
+                objects=tuple(
+                    _object(data, row, ids[row], [ids[start + p] for p in parents[row]])
+                    for row in range(start, stop)
+                ),
+                default_position=data["scene_default_position"][i] * UNIT,
+                default_rotation=int(data["scene_default_rotation"][i]),
+            )
+        )
+        start = stop
+    return scenes
+
+
+def _object(data: dict[str, np.ndarray], row: int, name: str, parents: list[str]) -> SceneObject:
+    corner = int(data["object_corners"][row])
+    rotation = data["object_rotation"][row] / 1000
+    return SceneObject(
+        object_id=name,
+        object_class=data["class_name"][data["object_class"][row]].decode(),
+        box=data["object_box"][row] * UNIT,
+        corners=data["corners"][corner] * UNIT if corner >= 0 else None,
+        rotation=(float(rotation[0]), float(rotation[1]), float(rotation[2])),
+        openable=bool(data["object_openable"][row]),
+        is_open=bool(data["object_is_open"][row]),
+        pickupable=bool(data["object_pickupable"][row]),
+        parents=tuple(parents),
+        visible=bool(data["object_visible"][row]),
+    )

@@ -1,0 +1,36 @@
+"""Plain records of a room: what any source of scenes must deliver."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+GRID = 0.25  # metres between neighbouring reachable points
+CAMERA_ABOVE_AGENT = 0.675  # metres from the agent's y to its camera, AI2-THOR's default agent
+
+
+@dataclass(frozen=True, eq=False)
+class SceneObject:
+    """One object of a room. Lengths in metres, y up, AI2-THOR's left-handed world axes."""
+
+    object_id: str
+    object_class: str
+    box: np.ndarray  # [2, 3] float64, least and greatest corner of the axis-aligned box
+    corners: np.ndarray | None = None  # [8, 3] float64, corners of the oriented box if known
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # degrees about x, y, z
+    openable: bool = False
+    is_open: bool = False
+    pickupable: bool = False
+    parents: tuple[str, ...] = ()  # object ids of the receptacles that hold it
+    visible: bool | None = None  # AI2-THOR's own flag in the scene's default pose, if known
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A room: where an agent can stand, and what stands around it."""
+
+    name: str
+    room_type: int  # index into vocabulary.ROOM_TYPES
+    points: np.ndarray  # [P, 3] float64, reachable agent positions; metres
+    objects: tuple[SceneObject, ...]  # sorted by (class, id)
+    default_position: np.ndarray | None = None  # [3] float64, agent in the metadata's frame
+    default_rotation: int | None = None  # degrees clockwise from +z, horizon 0
