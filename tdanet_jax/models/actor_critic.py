@@ -1,0 +1,93 @@
+"""The recurrent actor-critic that every encoder plugs into: features -> LSTM -> policy, value."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from tdanet_jax.env import Observation
+from tdanet_jax.models.layers import LSTM, Carry, Linear
+from tdanet_jax.vocabulary import NUM_ACTIONS
+
+
+class Output(NamedTuple):
+    """What the network says about a batch of states."""
+
+    logits: jax.Array  # [..., 6], unnormalised log-probabilities of the actions
+    value: jax.Array  # [...], expected discounted return
+
+
+class ActorCritic(nn.Module):
+    """An encoder, the previous step's action probabilities, an LSTM, an actor and a critic.
+
+    Attributes:
+      encoder: a module with `prepare(words) -> table` and `(table, obs, keep) -> features`.
+      hidden: units of the LSTM.
+      action_width: units of the embedding of the previous action probabilities.
+      dtype: operands of the LSTM's products.
+    """
+
+    encoder: nn.Module
+    hidden: int = 512
+    action_width: int = 10
+    dtype: Any = jnp.float32
+
+    def setup(self) -> None:
+        self.action_embedding = Linear(self.action_width)
+        self.lstm = LSTM(self.hidden, self.dtype)
+        small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
+        self.actor = Linear(NUM_ACTIONS, kernel_init=small)
+        self.critic = Linear(1)
+
+    def prepare(self, words: jax.Array) -> Any:
+        """What the encoder can say from word vectors [C, D] alone; once per parameter change."""
+        return self.encoder.prepare(words)
+
+    def __call__(
+        self,
+        table: Any,
+        carry: Carry,
+        obs: Observation,
+        previous: jax.Array,
+        fresh: jax.Array,
+        keep: jax.Array | None = None,
+    ) -> tuple[Carry, Output]:
+        """One step for a batch [B], or a rollout [T, B].
+
+        Args:
+          table: from `prepare`.
+          carry: recurrent state before the (first) step, each [B, H].
+          obs: observations.
+          previous: [..., 6] action probabilities of the previous step; zeros where fresh.
+          fresh: [...] bool, True where an episode starts.
+          keep: [..., H] bool, units that dropout keeps; None when not training.
+        """
+        features = self.encoder(table, obs, keep)
+        action = nn.relu(self.action_embedding(previous))
+        inputs = jnp.concatenate([features, action], axis=-1)
+        carry, hidden = self.lstm(carry, inputs, fresh)
+        return carry, Output(self.actor(hidden), self.critic(hidden)[..., 0])
+
+    def initial_carry(self, batch: int) -> Carry:
+        """The recurrent state at the start of an episode: zeros."""
+        return jnp.zeros((batch, self.hidden)), jnp.zeros((batch, self.hidden))
+
+    def initialise(self, key: jax.Array, words: jax.Array) -> Any:
+        """Fresh parameters for word vectors [C, D]."""
+
+        def everything(module: ActorCritic) -> Output:
+            blank = Observation(
+                classes=jnp.zeros((1, 1), jnp.int32),
+                boxes=jnp.zeros((1, 1, 3)),
+                mask=jnp.zeros((1, 1), bool),
+                target=jnp.zeros((1,), jnp.int32),
+                empty=jnp.ones((1,), bool),
+            )
+            previous, fresh = jnp.zeros((1, NUM_ACTIONS)), jnp.ones((1,), bool)
+            table = module.prepare(words)
+            return module(table, module.initial_carry(1), blank, previous, fresh)[1]
+
+        return nn.init(everything, self)(key)["params"]

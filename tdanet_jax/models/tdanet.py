@@ -1,0 +1,127 @@
+"""TDANet's encoder (Lian and Zhang 2024): target attention and a Siamese comparison.
+
+Target attention (TA, Eq. 1): the target and every detection go through one linear map W_L; the
+logits are inner products, the weights their masked softmax, and V_L1 = V_att M_L1. Siamese
+architecture (SA, Eq. 2): the same layers on the attended detection and on the target, and the
+absolute difference of the two.
+
+Three equal, cheaper forms are used; a test holds them equal to the printed ones. All class names
+are known while training, so the products of word vectors are taken once per update for the table
+of classes (`prepare`) and looked up per detection. Linear1 is linear where V_L1 = V_att M_L1, so
+detections are pooled before they are projected. The target's branch is the same for every frame.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from flax import struct
+
+from tdanet_jax.env import Observation
+from tdanet_jax.models.layers import Linear
+
+#: Centre and area that stand before the target's word vector in its row.
+TARGET_BOX = (0.5, 0.5, 0.25)
+
+
+@struct.dataclass
+class ClassTable:
+    """What is known of a class before any frame is seen. First axis C_t: the class as target."""
+
+    words: jax.Array  # [C, D], word vector of each class
+    class_logits: jax.Array  # [C_t, C], attention logit of a class's word vector
+    box_logits: jax.Array  # [C_t, 3], attention logit of a unit of x, y and S
+    reference: jax.Array  # [C_t, H], the target's branch of the Siamese comparison
+
+
+class TDANetEncoder(nn.Module):
+    """Detections and a target class in, H features out.
+
+    Attributes:
+      width: H, units of every layer.
+      dropout: share of the absolute difference that is dropped in training.
+      target_attention: False replaces TA by the mean of the detections (the paper's Table IV).
+      siamese: False replaces SA by the attended feature alone (Table IV). With neither, nothing
+        would be left of the target, so its word vector is appended to the features.
+      dtype: operands of the products; parameters and sums stay float32.
+    """
+
+    width: int = 512
+    dropout: float = 0.25
+    target_attention: bool = True
+    siamese: bool = True
+    dtype: Any = jnp.float32
+
+    def setup(self) -> None:
+        def linear() -> Linear:
+            return Linear(self.width, self.dtype, nn.initializers.he_uniform())
+
+        if self.target_attention:
+            self.attention = Linear(self.width)
+        self.linear1, self.linear2, self.linear3, self.linear4 = (linear() for _ in range(4))
+
+    def prepare(self, words: jax.Array) -> ClassTable:
+        """Everything that depends on class names alone, from their word vectors [C, D]."""
+        chex.assert_rank(words, 2)
+        count = words.shape[0]
+        box = jnp.broadcast_to(jnp.asarray(TARGET_BOX, words.dtype), (count, 3))
+        targets = jnp.concatenate([box, words], axis=-1)  # [C, 3 + D]
+        class_logits, box_logits = jnp.zeros((count, count)), jnp.zeros((count, 3))
+        if self.target_attention:
+            queries = self.attention(targets)  # [C, H]
+            # W_L of a row is the sum over its parts, so the logits are, too.
+            nothing = self.attention(jnp.zeros((1, words.shape[1] + 3)))  # the bias
+            units = self.attention(jnp.eye(3, words.shape[1] + 3)) - nothing  # [3, H]
+            names = self.attention(jnp.pad(words, ((0, 0), (3, 0))))  # [C, H], bias included
+            class_logits, box_logits = queries @ names.T, queries @ units.T
+        return ClassTable(words, class_logits, box_logits, self.branch(targets))
+
+    def branch(self, rows: jax.Array) -> jax.Array:
+        """Linear1 and Linear2, shared by the attended detection and the target."""
+        return nn.relu(self.linear2(nn.relu(self.linear1(rows))))
+
+    def attend(self, table: ClassTable, obs: Observation) -> jax.Array:
+        """Attention over the detections: [..., K], 0 in padding, summing to 1 in any frame.
+
+        In a frame without detections the first row, all zero, gets all of it.
+        """
+        first = jnp.arange(obs.mask.shape[-1]) == 0
+        mask = obs.mask | (obs.empty[..., None] & first)
+        if not self.target_attention:
+            return mask / mask.sum(-1, keepdims=True)
+        target = obs.target[..., None]
+        logits = table.class_logits[target, obs.classes]
+        logits += jnp.einsum("...i,...ki->...k", table.box_logits[obs.target], obs.boxes)
+        return nn.softmax(logits, axis=-1, where=mask)
+
+    def __call__(
+        self, table: ClassTable, obs: Observation, keep: jax.Array | None = None
+    ) -> jax.Array:
+        """The features of a batch of observations.
+
+        Args:
+          table: from `prepare`, with the same parameters.
+          obs: observations with leading axes [...].
+          keep: [..., H] bool, which units dropout keeps; None when not training.
+
+        Returns:
+          [..., H] float32.
+        """
+        weights = self.attend(table, obs)
+        chex.assert_equal_shape([weights, obs.mask, obs.classes])
+        # The all-zero row of an empty frame has no word vector either.
+        worded = jnp.where(obs.mask, weights, 0.0)
+        boxes = jnp.einsum("...k,...ki->...i", weights, obs.boxes)
+        names = jnp.einsum("...k,...kd->...d", worded, table.words[obs.classes])
+        features = self.branch(jnp.concatenate([boxes, names], axis=-1))
+        if self.siamese:
+            features = jnp.abs(features - table.reference[obs.target])
+        if keep is not None and self.dropout > 0:
+            features = jnp.where(keep, features / (1 - self.dropout), 0.0)
+        if not self.siamese and not self.target_attention:
+            features = jnp.concatenate([features, table.words[obs.target]], axis=-1)
+        return nn.relu(self.linear4(nn.relu(self.linear3(features))))
