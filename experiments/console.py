@@ -1,0 +1,101 @@
+"""What the commands share at the edge: errors in one line, progress, and stopping on a signal."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+console = Console(stderr=False, highlight=False, soft_wrap=True)
+
+
+def fail(message: object) -> None:
+    """Ends the program with one line on standard error and exit status 2."""
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+@contextlib.contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Turns errors that a user can cause (ValueError, OSError) into one line."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        fail(error)
+
+
+class StopRequest:
+    """Remembers the first SIGTERM or Ctrl-C; a second Ctrl-C interrupts as usual."""
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+        signal.signal(signal.SIGTERM, self._remember)
+        signal.signal(signal.SIGINT, self._remember)
+
+    def _remember(self, number: int, frame: Any) -> None:
+        if self.signal is not None:
+            raise KeyboardInterrupt
+        self.signal = number
+
+
+class _Figures(ProgressColumn):
+    """The line of figures that changes with every chunk."""
+
+    def render(self, task: Task) -> Text:
+        return Text(str(task.fields.get("figures", "")))
+
+
+def progress_bar() -> Progress:
+    """A bar with share done, figures, time spent and time left."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.percentage:>5.1f} %"),
+        _Figures(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+@contextlib.contextmanager
+def reporter(title: str, every: int = 1) -> Iterator[Callable[[float, str], None]]:
+    """Shows progress: `report(share, figures)`, a live bar on a terminal, else a line now and then.
+
+    Args:
+      title: what is going on.
+      every: without a terminal, print only every so many reports.
+    """
+    if console.is_terminal:
+        with progress_bar() as bar:
+            task = bar.add_task(title, total=1.0, figures="")
+
+            def live(share: float, figures: str) -> None:
+                bar.update(task, completed=min(share, 1.0), figures=figures)
+
+            yield live
+        return
+    count = 0
+
+    def plain(share: float, figures: str) -> None:
+        nonlocal count
+        count += 1
+        if count % every == 0 or share >= 1.0:
+            console.print(f"{title} {100 * min(share, 1.0):5.1f} %  {figures}")
+
+    yield plain

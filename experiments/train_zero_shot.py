@@ -1,0 +1,189 @@
+"""Trains an agent on the iTHOR training rooms and reports SR and SPL in the test rooms.
+
+    python -m experiments.train_zero_shot --split 18/4
+
+Writes config.json, metrics.jsonl, checkpoints, results.json, results.md, episodes.jsonl and
+learning_curve.png into --out (by default runs/<split>-<model>-seed<seed>-<time>).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from experiments.console import StopRequest, console, fail, one_line_errors, reporter
+from tdanet_jax import config as configs
+from tdanet_jax.config import PRESETS, TrainConfig
+
+if TYPE_CHECKING:
+    from tdanet_jax.episodes import Episodes
+    from tdanet_jax.training import Row, Run
+
+CONFIG_FILE = "config.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Trains an agent on the iTHOR training rooms and reports SR and SPL in the test rooms."""
+
+    run: tyro.conf.OmitArgPrefixes[TrainConfig]
+    preset: Literal["default", "paper"] = "default"
+    """paper: the reference's constants and its budget of 6 M episodes; other flags still apply."""
+    out: Path | None = None
+    """Folder for everything that the run writes; must be new or empty."""
+    resume: Path | None = None
+    """Folder of a run to go on with, to its original budget; takes no other flag."""
+    tensorboard: bool = False
+    """Also write TensorBoard events (needs tensorboardX)."""
+
+
+def parse(arguments: list[str]) -> Command:
+    """The command line; `--preset` chooses the defaults of the flags beside it."""
+    preset = "default"
+    for i, word in enumerate(arguments):
+        if word.startswith("--preset"):
+            preset = word.partition("=")[2] or "".join(arguments[i + 1 : i + 2])
+    default = Command(run=PRESETS.get(preset, PRESETS["default"]))
+    return tyro.cli(Command, args=arguments, default=default, prog="train_zero_shot")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command."""
+    words = sys.argv[1:] if arguments is None else arguments
+    with one_line_errors():
+        command = parse(words)
+        if command.resume is not None:
+            if len(words) > 2:
+                fail("--resume goes on to the original budget and takes no other flag")
+            folder, config = command.resume, configs.load(command.resume / CONFIG_FILE)
+        else:
+            config = command.run
+            config.check()
+            folder = command.out or default_folder(config)
+            if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+                fail(f"--out {folder}: exists and is not empty (to go on there: --resume {folder})")
+        train(config, folder, command.tensorboard)
+
+
+def default_folder(config: TrainConfig) -> Path:
+    """runs/18-4-tdanet-seed0-20260131-120000."""
+    split = config.split.replace("/", "-") + ("-validation" if config.validation else "")
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    return Path("runs") / f"{split}-{config.model}-seed{config.seed}-{stamp}"
+
+
+def train(config: TrainConfig, folder: Path, tensorboard: bool) -> None:
+    """Trains to the end of the budget, then evaluates and reports."""
+    from tdanet_jax import episodes, figures, scenes, words
+    from tdanet_jax.task import make_task
+    from tdanet_jax.training import Run, read_metrics
+
+    stop = StopRequest()
+    with reporter("rooms", every=30) as report_rooms:
+        tables = scenes.load_tables(lambda done, total: report_rooms(done / total, "rebuilt"))
+    task = make_task(config, tables, words.load_bundled())
+    lists = episodes.load(tables, task.split)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / CONFIG_FILE).write_text(json.dumps(configs.to_json(config), indent=2) + "\n")
+    run = Run(folder, config, task)
+    console.print(f"{config.model}, split {task.split.name}, seed {config.seed} -> {folder}")
+    console.print("compiling ...")
+    saved = run.seconds
+    with reporter("training", every=20) as report, metrics_sink(folder, tensorboard) as sink:
+        for row in run.chunks():
+            report(
+                run.progress,
+                f"{row['steps_per_second']:,.0f} steps/s  {row['episodes']:,} episodes  "
+                f"SR {100 * row['success']:.1f}  SPL {100 * row['spl']:.1f}  "
+                f"entropy {row['entropy']:.2f}",
+            )
+            sink(row)
+            if run.seconds - saved > 60 * config.checkpoint_minutes:
+                run.save()
+                saved = run.seconds
+            if stop.signal is not None:
+                run.save()
+                console.print(
+                    f"stopped and saved; go on with: "
+                    f"python -m experiments.train_zero_shot --resume {folder}"
+                )
+                raise SystemExit(128 + stop.signal)
+    run.save()
+    title = f"{config.model}, split {task.split.name}, seed {config.seed}"
+    figures.learning_curve(read_metrics(folder), title, folder / "learning_curve.png")
+    console.print("evaluating ...")
+    out = evaluate(run, lists)
+    for group in ("seen", "unseen"):
+        if out[group] is not None:
+            console.print(summary_line(group, out[group]["L>=1"]))
+    console.print(f"wrote {folder / 'results.md'}")
+
+
+def evaluate(run: Run, lists: dict[str, Episodes]) -> dict[str, Any]:
+    """Plays the fixed episodes with sampled actions and writes the results; returns them."""
+    import jax
+
+    from tdanet_jax import evaluation, policies, report
+
+    config, task = run.config, run.task
+    policy = policies.network(run.model, task.words)
+    key = jax.random.key(config.seed)
+    played = {}
+    for i, (group, chosen) in enumerate(lists.items()):
+        group_key = jax.random.fold_in(key, i)
+        weights = run.state.params
+        played[group] = (
+            chosen,
+            evaluation.evaluate(policy, weights, task.eval_params, chosen, group_key),
+        )
+    provenance = report.Provenance(
+        split=task.split.name,
+        model=config.model,
+        policy="sample",
+        episodes_trained=int(run.state.episodes),
+        seed=config.seed,
+        steps=run.steps,
+        data_version=task.tables.data_version,
+    )
+    return report.write(run.folder, provenance, task.tables, played)
+
+
+def summary_line(group: str, bucket: dict[str, Any]) -> str:
+    """seen targets, 1000 episodes: SR 75.1 (70.2 to 80.0), SPL ..."""
+    parts = []
+    for name in ("SR", "SPL"):
+        low, high = bucket[f"{name}_ci"]
+        parts.append(f"{name} {bucket[name]:.1f} ({low:.1f} to {high:.1f})")
+    return f"{group} targets, {bucket['n']} episodes: {', '.join(parts)}"
+
+
+@contextlib.contextmanager
+def metrics_sink(folder: Path, tensorboard: bool) -> Iterator[Callable[[Row], None]]:
+    """Where rows of metrics go beside `metrics.jsonl`: TensorBoard, or nowhere."""
+    if not tensorboard:
+        yield lambda row: None
+        return
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        fail("--tensorboard needs tensorboardX: pip install 'tdanet-jax[tensorboard]'")
+    with SummaryWriter(str(folder / "tensorboard")) as writer:
+
+        def write(row: Row) -> None:
+            for name, value in row.items():
+                if name != "steps":
+                    writer.add_scalar(f"train/{name}", value, row["steps"])
+
+        yield write
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,192 @@
+"""Everything that can be set on a training run, as frozen dataclasses. Imports no JAX."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from tdanet_jax.vocabulary import UNSEEN
+
+MODELS = ("tdanet",)
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnerConfig:
+    """The update's constants. The reference's own are those of `--preset paper`."""
+
+    num_envs: int = 512
+    """Environments that step together (B)."""
+    rollout_steps: int = 20
+    """Actions per environment and update (T)."""
+    learning_rate: float = 6e-4
+    """Adam's step size at the start."""
+    final_learning_rate: float = 0.0
+    """Adam's step size at the end of the budget; falls linearly."""
+    amsgrad: bool = False
+    """AMSGrad in place of Adam, as in the reference."""
+    adam_epsilon: float = 1e-8
+    """Added to Adam's denominator."""
+    max_grad_norm: float = 0.5
+    """Gradients are scaled down to this norm."""
+    gamma: float = 0.99
+    """Discount per action."""
+    gae_lambda: float = 0.95
+    """GAE's lambda; the reference's tau is 1."""
+    entropy_weight: float = 0.01
+    """Weight of the policy's entropy (nats) in the loss, at the start."""
+    final_entropy_weight: float = 0.01
+    """Weight of the entropy at the end of the budget; changes linearly."""
+    value_weight: float = 0.5
+    """Weight of the squared error of the values."""
+    step_limit: int = 50
+    """Actions after which a training episode is truncated."""
+    bootstrap_truncated: bool = True
+    """Values the state in which a time-out cut an episode; False takes it for an end, as the
+    reference does."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """The network and what it is shown."""
+
+    width: int = 512
+    """Units of every layer of the encoder."""
+    hidden: int = 512
+    """Units of the LSTM."""
+    dropout: float = 0.25
+    """Share of the Siamese difference that is dropped in training."""
+    rows: Literal["class", "object"] = "class"
+    """One detection per class (extent over its instances) or per object, as in the paper."""
+    word_norm: float = 3.0
+    """Length that every word vector is scaled to."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Operands of the large products; parameters and sums are always float32."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """One training run."""
+
+    split: str = "18/4"
+    """Seen/unseen target classes: 22/0, 18/4 or 14/8."""
+    model: str = "tdanet"
+    """The model to train: tdanet."""
+    steps: int = 10_000_000
+    """Budget in environment steps (actions)."""
+    episodes: int | None = None
+    """Stop after this many training episodes instead; the paper's budget is 6,000,000."""
+    minutes: float | None = None
+    """Stop after this much training time, tables, compilation and evaluation not counted."""
+    seed: int = 0
+    """Seed of parameters, episodes, actions and dropout."""
+    validation: bool = False
+    """Train on 16 of the 20 training rooms of a type, hold one more class out, and evaluate on the
+    other four rooms: for every choice that is not the final number."""
+    chunk_updates: int = 10
+    """Updates in one compiled call, between two looks at the progress."""
+    checkpoint_minutes: float = 2.0
+    """Time between two checkpoints."""
+    learner: LearnerConfig = dataclasses.field(default_factory=LearnerConfig)
+    """The update."""
+    network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
+    """The network."""
+
+    def check(self) -> None:
+        """Raises ValueError, with one line that names the flag, if a value is out of range."""
+        if self.split not in UNSEEN:
+            raise ValueError(f"--split {self.split}: choose one of {', '.join(UNSEEN)}")
+        if self.model not in MODELS:
+            raise ValueError(f"--model {self.model}: choose one of {', '.join(MODELS)}")
+        positive = {
+            "--steps": self.steps,
+            "--episodes": self.episodes,
+            "--minutes": self.minutes,
+            "--chunk-updates": self.chunk_updates,
+            "--checkpoint-minutes": self.checkpoint_minutes,
+            "--num-envs": self.learner.num_envs,
+            "--rollout-steps": self.learner.rollout_steps,
+            "--step-limit": self.learner.step_limit,
+            "--learning-rate": self.learner.learning_rate,
+            "--width": self.network.width,
+            "--hidden": self.network.hidden,
+            "--word-norm": self.network.word_norm,
+        }
+        for flag, value in positive.items():
+            if value is not None and not value > 0:
+                raise ValueError(f"{flag} {value}: must be positive")
+        shares = {
+            "--gamma": self.learner.gamma,
+            "--gae-lambda": self.learner.gae_lambda,
+            "--dropout": self.network.dropout,
+        }
+        for flag, value in shares.items():
+            if not 0 <= value <= 1 or (flag == "--dropout" and value == 1):
+                raise ValueError(f"{flag} {value}: must be a share between 0 and 1")
+
+    @property
+    def steps_per_update(self) -> int:
+        """Environment steps in one update."""
+        return self.learner.num_envs * self.learner.rollout_steps
+
+
+#: The reference's constants, on our environment and update.
+PAPER = TrainConfig(
+    episodes=6_000_000,
+    learner=LearnerConfig(
+        learning_rate=1e-4,
+        final_learning_rate=1e-4,
+        amsgrad=True,
+        max_grad_norm=100.0,
+        gamma=0.99,
+        gae_lambda=1.0,
+        entropy_weight=0.01,
+        final_entropy_weight=0.01,
+        value_weight=0.5,
+        step_limit=30,
+        bootstrap_truncated=False,
+    ),
+    network=NetworkConfig(dropout=0.25, rows="object"),
+)
+PRESETS = {"default": TrainConfig(), "paper": PAPER}
+
+
+def to_json(config: TrainConfig) -> dict[str, Any]:
+    """A configuration as plain JSON values."""
+    return dataclasses.asdict(config)
+
+
+def from_json(values: Mapping[str, Any]) -> TrainConfig:
+    """What `to_json` gave.
+
+    Raises:
+      ValueError: a field is missing, unknown or out of range.
+    """
+    try:
+        config = TrainConfig(
+            **{
+                **values,
+                "learner": LearnerConfig(**values["learner"]),
+                "network": NetworkConfig(**values["network"]),
+            }
+        )
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"not a configuration of this version: {error}") from None
+    config.check()
+    return config
+
+
+def load(path: Path) -> TrainConfig:
+    """Reads a run's `config.json`.
+
+    Raises:
+      ValueError: the file is missing or unreadable; the message names it.
+    """
+    try:
+        return from_json(json.loads(path.read_text()))
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; is this the folder of a run?") from None
+    except (json.JSONDecodeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from None

@@ -1,0 +1,117 @@
+"""Fixed lists of evaluation episodes, committed as integers with the hash of their tables."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tdanet_jax import assets
+from tdanet_jax.env import POSES_PER_POSITION, ROTATIONS
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.vocabulary import ROOM_TYPES, UNSEEN, Split, make_split
+
+ASSET = "episodes.npz"
+EPISODES_PER_ROOM_TYPE = 250
+GROUPS = ("seen", "unseen")
+#: Seed of the lists; they change only with the tables.
+LIST_SEED = 20240413
+
+
+@dataclasses.dataclass(frozen=True)
+class Episodes:
+    """Starts and targets of E episodes.
+
+    Attributes:
+      pose: [E] int32, start pose in the full tables.
+      target: [E] int32, index among the tables' targets.
+    """
+
+    pose: np.ndarray
+    target: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+
+def draw(
+    tables: SceneTables,
+    scenes: Sequence[str],
+    targets: Mapping[str, Sequence[str]],
+    per_room_type: int,
+    seed: int,
+) -> Episodes:
+    """Draws episodes as training does: scene, target and start uniform, each given the one before.
+
+    A target is drawn among those of the room type that can be reached in the scene from somewhere,
+    a start among the positions that can reach it, its rotation among the eight; the horizon is 0.
+    """
+    rng = np.random.default_rng(seed)
+    index = {name: i for i, name in enumerate(tables.scenes)}
+    reachable = tables.distance.reshape(-1, POSES_PER_POSITION, len(tables.targets))[:, 0] >= 0
+    poses, goals = [], []
+    for room in ROOM_TYPES:
+        options = []
+        for scene in scenes:
+            if ROOM_TYPES[tables.room_type[index[scene]]] != room:
+                continue
+            positions = np.flatnonzero(tables.position_scene == index[scene])
+            found = [tables.targets.index(name) for name in targets.get(room, ())]
+            found = [goal for goal in found if reachable[positions, goal].any()]
+            if found:
+                options.append((positions, found))
+        for _ in range(per_room_type if options else 0):
+            positions, found = options[rng.integers(len(options))]
+            goal = found[rng.integers(len(found))]
+            valid = positions[reachable[positions, goal]]
+            position = valid[rng.integers(len(valid))]
+            poses.append((position * ROTATIONS + rng.integers(ROTATIONS)) * 2)
+            goals.append(goal)
+    return Episodes(np.array(poses, np.int32), np.array(goals, np.int32))
+
+
+def draw_split(tables: SceneTables, split: Split) -> dict[str, Episodes]:
+    """The seen and the unseen list of a split; a split without unseen classes has none."""
+    lists = {}
+    for group, targets in zip(GROUPS, (split.seen, split.unseen), strict=True):
+        if any(targets.values()):
+            seed = LIST_SEED + GROUPS.index(group)
+            lists[group] = draw(tables, split.eval_scenes, targets, EPISODES_PER_ROOM_TYPE, seed)
+    return lists
+
+
+def build_asset(tables: SceneTables, out_dir: Path) -> Path:
+    """Writes the lists of every split, and of its validation, for these tables."""
+    arrays = {"data_version": np.frombuffer(tables.data_version.encode(), np.uint8)}
+    for name in UNSEEN:
+        for validation in (False, True):
+            split = make_split(name, validation)
+            for group, episodes in draw_split(tables, split).items():
+                arrays[f"{split.name}/{group}/pose"] = episodes.pose
+                arrays[f"{split.name}/{group}/target"] = episodes.target
+    np.savez(out_dir / ASSET, **arrays)  # type: ignore[arg-type]
+    return out_dir / ASSET
+
+
+def load(tables: SceneTables, split: Split) -> dict[str, Episodes]:
+    """The committed lists of a split: group -> episodes.
+
+    Raises:
+      ValueError: the lists belong to other tables.
+    """
+    with np.load(assets.path(ASSET), allow_pickle=False) as data:
+        version = bytes(data["data_version"]).decode()
+        if version != tables.data_version:
+            raise ValueError(
+                f"{ASSET} belongs to scene tables {version}, these are {tables.data_version}: "
+                "run `python -m experiments.scenes episodes`"
+            )
+        return {
+            group: Episodes(
+                data[f"{split.name}/{group}/pose"], data[f"{split.name}/{group}/target"]
+            )
+            for group in GROUPS
+            if f"{split.name}/{group}/pose" in data
+        }

@@ -1,0 +1,82 @@
+"""Runs a policy on a fixed list of episodes, in one compiled call."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tdanet_jax import env
+from tdanet_jax.env import EnvParams
+from tdanet_jax.episodes import Episodes
+from tdanet_jax.policies import Policy
+
+
+@dataclasses.dataclass(frozen=True)
+class Records:
+    """What happened in each of E episodes.
+
+    Attributes:
+      shortest: [E] int32, L, actions on the optimal path with Done.
+      length: [E] int32, e, actions taken with Done.
+      success: [E] bool, Done while an instance of the target was visible.
+      actions: [E, N] int8, actions taken; -1 behind the last, N the largest step limit.
+    """
+
+    shortest: np.ndarray
+    length: np.ndarray
+    success: np.ndarray
+    actions: np.ndarray
+
+
+def evaluate(
+    policy: Policy, weights: Any, params: EnvParams, episodes: Episodes, key: jax.Array
+) -> Records:
+    """Lets `policy` play every episode to its end. One compiled call; equal keys, equal records."""
+    limit = int(np.max(np.asarray(params.step_limit)))
+    pose, target = jnp.asarray(episodes.pose), jnp.asarray(episodes.target)
+    out = jax.device_get(_play(policy, limit, weights, params, pose, target, key))
+    return Records(*out)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _play(
+    policy: Policy,
+    limit: int,
+    weights: Any,
+    params: EnvParams,
+    pose: jax.Array,
+    target: jax.Array,
+    key: jax.Array,
+) -> tuple[jax.Array, ...]:
+    count = pose.shape[0]
+    transition = jax.vmap(env.transition, (0, 0, None))
+    state = jax.vmap(env.start, (None, 0, 0))(params, pose, target)
+
+    def unfinished(loop: tuple) -> jax.Array:
+        step, _, _, alive, _, _ = loop
+        return (step < limit) & jnp.any(alive)
+
+    def body(loop: tuple) -> tuple:
+        step, state, memory, alive, success, actions = loop
+        memory, action = policy.act(weights, memory, jax.random.fold_in(key, step), state, params)
+        out = transition(state, action, params)
+        state = jax.tree.map(lambda new, old: jnp.where(alive, new, old), out.state, state)
+        actions = actions.at[:, step].set(jnp.where(alive, action, -1).astype(jnp.int8))
+        success = success | (alive & out.success)
+        return step + 1, state, memory, alive & ~out.terminated & ~out.truncated, success, actions
+
+    loop = (
+        jnp.zeros((), jnp.int32),
+        state,
+        policy.start(weights, count),
+        jnp.ones(count, bool),
+        jnp.zeros(count, bool),
+        jnp.full((count, limit), -1, jnp.int8),
+    )
+    _, state, _, _, success, actions = jax.lax.while_loop(unfinished, body, loop)
+    return state.shortest, state.steps, success, actions

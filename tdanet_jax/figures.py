@@ -1,0 +1,40 @@
+"""Pictures of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+#: Colours (Okabe and Ito) that stay apart for the colour-blind and, with the dashes, in grey.
+BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"
+
+
+def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> None:
+    """Success, SPL, episode length and entropy against training episodes, from metrics rows."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    episodes = [row["episodes"] for row in rows]
+    left.plot(episodes, [100 * row["success"] for row in rows], color=BLUE, label="SR")
+    left.plot(episodes, [100 * row["spl"] for row in rows], "--", color=ORANGE, label="SPL")
+    left.set(ylabel="per cent, training rooms", ylim=(0, 100))
+    right.plot(episodes, [row["length"] for row in rows], color=GREEN, label="actions per episode")
+    right.set(ylabel="actions per episode", ylim=(0, None))
+    entropy = right.twinx()
+    entropy.plot(episodes, [row["entropy"] for row in rows], ":", color="0.3", label="entropy")
+    entropy.set(ylabel="entropy of the policy (nats)", ylim=(0, None))
+    handles = [*right.get_lines(), *entropy.get_lines()]
+    right.legend(handles=handles, loc="upper right", frameon=False)
+    left.legend(loc="lower right", frameon=False)
+    for axis in (left, right):
+        axis.set_xlabel("training episodes")
+        axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x / 1000:,.0f}k"))
+        axis.grid(alpha=0.3)
+        axis.spines[["top"]].set_visible(False)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=130)

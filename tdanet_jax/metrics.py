@@ -1,0 +1,91 @@
+"""Success rate and SPL, with confidence intervals (the paper's Eqs. 4 and 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+#: The two groups of episodes that the literature reports: L at least 1, and at least 5.
+BUCKETS = {"L>=1": 1, "L>=5": 5}
+BOOTSTRAP_SAMPLES = 2_000
+CONFIDENCE = 0.95
+
+
+def spl(success: np.ndarray, shortest: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Success weighted by path length of each episode: S * L / max(L, e), in [0, 1]."""
+    return success * shortest / np.maximum(shortest, length)
+
+
+def summarise(
+    success: np.ndarray, shortest: np.ndarray, length: np.ndarray, cluster: np.ndarray
+) -> dict[str, dict[str, object]]:
+    """SR and SPL in percent, per bucket of L.
+
+    Args:
+      success: [E] bool.
+      shortest: [E] L, length: [E] e, both with Done.
+      cluster: [E] int, the (room, target) pair of each episode. Episodes of one pair are alike, so
+        the intervals resample pairs, not episodes.
+
+    Returns:
+      bucket -> SR, SPL, SR_ci, SPL_ci (each [low, high]) and n; None where n is 0.
+    """
+    efficiency = spl(success, shortest, length)
+    out: dict[str, dict[str, object]] = {}
+    for name, least in BUCKETS.items():
+        chosen = shortest >= least
+        values = 100.0 * np.stack([success[chosen], efficiency[chosen]]).astype(np.float64)
+        count = int(chosen.sum())
+        if count == 0:
+            out[name] = {"SR": None, "SPL": None, "SR_ci": None, "SPL_ci": None, "n": 0}
+            continue
+        low, high = cluster_interval(values, cluster[chosen])
+        mean = values.mean(axis=1)
+        out[name] = {
+            "SR": _round(mean[0]),
+            "SPL": _round(mean[1]),
+            "SR_ci": [_round(low[0]), _round(high[0])],
+            "SPL_ci": [_round(low[1]), _round(high[1])],
+            "n": count,
+        }
+    return out
+
+
+def cluster_interval(values: np.ndarray, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Percentile bootstrap interval of means, resampling whole clusters.
+
+    Args:
+      values: [M, E], M quantities.
+      cluster: [E] int.
+
+    Returns:
+      Lower and upper bound, [M] each.
+    """
+    _, member = np.unique(cluster, return_inverse=True)
+    clusters = int(member.max()) + 1
+    sums = np.stack([np.bincount(member, row, clusters) for row in values])  # [M, clusters]
+    sizes = np.bincount(member, minlength=clusters)
+    rng = np.random.default_rng(0)
+    drawn = rng.multinomial(clusters, np.full(clusters, 1 / clusters), BOOTSTRAP_SAMPLES)
+    means = (drawn @ sums.T) / (drawn @ sizes)[:, None]  # [samples, M]
+    tail = 50 * (1 - CONFIDENCE)
+    low, high = np.percentile(means, [tail, 100 - tail], axis=0)
+    return low, high
+
+
+def grouped(
+    columns: Mapping[str, np.ndarray], key: str, names: Iterable[str]
+) -> dict[str, dict[str, dict[str, object]]]:
+    """`summarise` for each value of a column, in the order of `names`; absent values left out."""
+    out = {}
+    for name in names:
+        chosen = columns[key] == name
+        if chosen.any():
+            picked = (columns[c][chosen] for c in ("success", "shortest", "length", "cluster"))
+            out[name] = summarise(*picked)
+    return out
+
+
+def _round(value: float) -> float:
+    return round(float(value), 2)

@@ -1,0 +1,215 @@
+"""What a run reports: `results.json`, `results.md` and one record per episode."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.resources
+import json
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import tdanet_jax
+from tdanet_jax.episodes import Episodes
+from tdanet_jax.evaluation import Records
+from tdanet_jax.metrics import BUCKETS, grouped, summarise
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS, ROOM_TYPES
+
+RESULTS_VERSION = 1
+
+#: The paper's Table I (Lian and Zhang 2024), SR and SPL in percent for L >= 1, by split and group.
+PAPER_ROWS = {
+    ("18/4", "seen"): {"Random": (11.2, 5.1), "TDANet": (74.7, 29.7)},
+    ("18/4", "unseen"): {"TDANet": (62.5, 25.3)},
+}
+WORLDS_DIFFER = (
+    "The worlds differ: the paper used AI2-THOR 1.0.1 and its own test episodes; these rooms are "
+    "rebuilt from the metadata of a later version and have longer episodes on average."
+)
+#: Unseen classes that have a near-synonym among the classes known in training.
+NEAR_SYNONYMS = {
+    "ToiletPaper": ("ToiletPaperHanger", "PaperTowelRoll"),
+    "Television": ("TVStand",),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Provenance:
+    """Where a result comes from; the fields of `results.json` that are not numbers of it."""
+
+    split: str
+    model: str
+    policy: str
+    episodes_trained: int
+    seed: int
+    steps: int
+    data_version: str
+
+
+def columns(tables: SceneTables, episodes: Episodes, records: Records) -> dict[str, np.ndarray]:
+    """Records as named columns of length E, with names in place of indices."""
+    position = episodes.pose >> 4
+    scene = tables.position_scene[position]
+    return {
+        "scene": np.array(tables.scenes)[scene],
+        "room": np.array(ROOM_TYPES)[tables.room_type[scene]],
+        "target": np.array(tables.targets)[episodes.target],
+        "x": tables.position[position, 0],
+        "z": tables.position[position, 2],
+        "rotation": 45 * ((episodes.pose >> 1) & 7),
+        "horizon": 30 * (episodes.pose & 1),
+        "shortest": records.shortest,
+        "length": records.length,
+        "success": records.success,
+        "cluster": scene.astype(np.int64) * len(tables.targets) + episodes.target,
+    }
+
+
+def results(provenance: Provenance, groups: Mapping[str, Mapping[str, np.ndarray]]) -> dict:
+    """The content of `results.json`, from the columns of each group."""
+
+    def summary(c: Mapping[str, np.ndarray]) -> dict:
+        return summarise(c["success"], c["shortest"], c["length"], c["cluster"])
+
+    def by(key: str, names: tuple[str, ...]) -> dict:
+        split = {group: grouped(c, key, names) for group, c in groups.items()}
+        found = (name for name in names if any(name in parts for parts in split.values()))
+        return {
+            name: {group: parts[name] for group, parts in split.items() if name in parts}
+            for name in found
+        }
+
+    return {
+        "version": RESULTS_VERSION,
+        **{k: v for k, v in dataclasses.asdict(provenance).items() if k in _HEAD},
+        "seen": summary(groups["seen"]),
+        "unseen": summary(groups["unseen"]) if "unseen" in groups else None,
+        "by_room": by("room", ROOM_TYPES),
+        "by_target": by("target", ALL_TARGETS),
+        "seed": provenance.seed,
+        "steps": provenance.steps,
+        "data_version": provenance.data_version,
+        "commit": code_version(),
+    }
+
+
+_HEAD = ("split", "model", "policy", "episodes_trained")
+
+
+def code_version() -> str:
+    """The commit of the checkout that the code runs from, else the package's version."""
+    here = Path(str(importlib.resources.files(tdanet_jax))).parent
+    if (here / ".git").exists():
+        command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            return done.stdout.strip()
+    return tdanet_jax.__version__
+
+
+def episode_rows(
+    group: str, column: Mapping[str, np.ndarray], records: Records
+) -> list[dict[str, Any]]:
+    """One plain record per episode; L and e as in the paper, both with Done."""
+    rows = []
+    for i in range(len(records.length)):
+        taken = records.actions[i, : records.length[i]]
+        rows.append(
+            {
+                "group": group,
+                **{k: str(column[k][i]) for k in ("scene", "room", "target")},
+                **{k: float(column[k][i]) for k in ("x", "z")},
+                **{k: int(column[k][i]) for k in ("rotation", "horizon")},
+                "L": int(records.shortest[i]),
+                "e": int(records.length[i]),
+                "success": bool(records.success[i]),
+                "actions": [ACTION_NAMES[a] for a in taken],
+            }
+        )
+    return rows
+
+
+def write(
+    folder: Path,
+    provenance: Provenance,
+    tables: SceneTables,
+    played: Mapping[str, tuple[Episodes, Records]],
+) -> dict:
+    """Writes `results.json`, `results.md` and `episodes.jsonl`; returns the results."""
+    groups = {name: columns(tables, *pair) for name, pair in played.items()}
+    out = results(provenance, groups)
+    (folder / "results.json").write_text(json.dumps(out, indent=2) + "\n")
+    (folder / "results.md").write_text(markdown(out, groups))
+    with (folder / "episodes.jsonl").open("w") as file:
+        for name, (_, records) in played.items():
+            for row in episode_rows(name, groups[name], records):
+                file.write(json.dumps(row) + "\n")
+    return out
+
+
+def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarray]]) -> str:
+    """`results.md`: the tables of the paper's form, with the paper's rows beside ours."""
+    lines = [
+        f"# {out['model']}, split {out['split']}, seed {out['seed']}",
+        "",
+        f"{out['episodes_trained']:,} training episodes, {out['steps']:,} environment steps; "
+        f"{out['policy']} actions; scene tables {out['data_version']}, code {out['commit']}.",
+        "",
+        "SR and SPL in percent, with 95 % bootstrap intervals over (room, target) pairs.",
+        "",
+        *_header("Targets", "Agent"),
+    ]
+    for group in ("seen", "unseen"):
+        if out[group] is None:
+            continue
+        lines.append(_row((group, f"**{out['model']} (ours)**"), out[group]))
+        for agent, (sr, rate) in PAPER_ROWS.get((out["split"], group), {}).items():
+            lines.append(f"| {group} | {agent} (paper) | {sr} | {rate} | | | | |")
+    if any(key[0] == out["split"] for key in PAPER_ROWS):
+        lines += ["", WORLDS_DIFFER]
+    lines.append("")
+    for group, column in groups.items():
+        share = 100 * float((column["shortest"] == 1).mean())
+        lines.append(f"Target in view at the start (L = 1), {group}: {share:.1f} % of episodes.")
+    for title, key in (("Room", "by_room"), ("Target", "by_target")):
+        lines += ["", f"## By {title.lower()}", "", *_header(title, "Group")]
+        for name, parts in out[key].items():
+            lines += [_row((name, group), buckets) for group, buckets in parts.items()]
+    lines += _near_synonyms(out)
+    return "\n".join(lines) + "\n"
+
+
+def _near_synonyms(out: Mapping[str, Any]) -> list[str]:
+    present = {
+        target: ", ".join(like)
+        for target, like in NEAR_SYNONYMS.items()
+        if "unseen" in out["by_target"].get(target, {})
+    }
+    if not present:
+        return []
+    lines = ["", "Unseen classes with a near-synonym among the classes known in training: "]
+    return [*lines, *(f"- {target} (like {like})" for target, like in present.items())]
+
+
+def _header(*first: str) -> list[str]:
+    names = [*first, *(f"{m} {bucket}" for bucket in BUCKETS for m in ("SR", "SPL", "n"))]
+    return [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"]
+
+
+def _row(first: tuple[str, ...], buckets: Mapping[str, Mapping[str, Any]]) -> str:
+    cells = [*first]
+    for bucket in BUCKETS:
+        part = buckets[bucket]
+        cells += [_cell(part, "SR"), _cell(part, "SPL"), str(part["n"])]
+    return f"| {' | '.join(cells)} |"
+
+
+def _cell(part: Mapping[str, Any], name: str) -> str:
+    if part[name] is None:
+        return "-"
+    low, high = part[f"{name}_ci"]
+    return f"{part[name]:.1f} ({low:.1f} to {high:.1f})"

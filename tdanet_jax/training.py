@@ -1,0 +1,155 @@
+"""A training run on disk: chunks of updates, metrics, checkpoints, and going on after a stop."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tdanet_jax import learner
+from tdanet_jax.checkpoint import Checkpoints
+from tdanet_jax.config import TrainConfig
+from tdanet_jax.learner import TrainState
+from tdanet_jax.task import Task, make_model
+
+METRICS_FILE = "metrics.jsonl"
+
+Row = dict[str, Any]
+
+
+class Run:
+    """A run in its folder. `state` is where it is, `seconds` the training time so far."""
+
+    def __init__(self, folder: Path, config: TrainConfig, task: Task) -> None:
+        self.folder = folder
+        self.config = config
+        self.task = task
+        self.model = make_model(config.network)
+        self.seconds = 0.0
+        self.checkpoints = Checkpoints(folder)
+        self.state: TrainState = self._make_state() if self.fresh else self._restore()
+        self._drop_rows_after(int(self.state.updates))
+
+    @property
+    def fresh(self) -> bool:
+        """Whether the folder holds no checkpoint yet."""
+        return self.checkpoints.latest() is None
+
+    def _make_state(self) -> TrainState:
+        task = self.task
+        key = jax.random.key(self.config.seed)
+        return learner.init(
+            key, self.config.learner, self.model, task.train_words, task.train_params
+        )
+
+    def _restore(self) -> TrainState:
+        state, meta = self.checkpoints.restore(self._make_state)
+        if meta["data_version"] != self.task.tables.data_version:
+            raise ValueError(
+                f"{self.folder}: trained on scene tables {meta['data_version']}, "
+                f"these are {self.task.tables.data_version}"
+            )
+        self.seconds = float(meta["seconds"])
+        return state
+
+    def save(self) -> None:
+        """Writes a checkpoint of the present state, unless there is one."""
+        if self.checkpoints.latest() != int(self.state.updates):
+            version = self.task.tables.data_version
+            self.checkpoints.save(self.state, {"seconds": self.seconds, "data_version": version})
+
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return int(self.state.updates) * self.config.steps_per_update
+
+    @property
+    def progress(self) -> float:
+        """Share of the budget that is spent; the run is over at 1.
+
+        The budget is `episodes` if given, else `steps`; `minutes` is a cap beside either.
+        """
+        config = self.config
+        spent = self.steps / config.steps
+        if config.episodes is not None:
+            spent = int(self.state.episodes) / config.episodes
+        if config.minutes is not None:
+            spent = max(spent, self.seconds / (60 * config.minutes))
+        return spent
+
+    def chunks(self) -> Iterator[Row]:
+        """Trains to the end of the budget; yields one row of metrics per chunk.
+
+        Compilation is not counted as training time. Stop iterating to stop training; `save` then
+        keeps what is done.
+        """
+        chunk = self._compile()
+        pace = 0.0  # share of the budget per chunk, as the last one went
+        while self.progress < 1.0:
+            before = self.progress
+            share = jnp.array([before, min(1.0, before + pace)], jnp.float32)
+            began = time.perf_counter()
+            self.state, metrics = chunk(
+                self.state, share, self.task.train_words, self.task.train_params
+            )
+            metrics = jax.device_get(metrics)
+            took = time.perf_counter() - began
+            self.seconds += took
+            pace = self.progress - before
+            row = self._row(metrics, took)
+            with (self.folder / METRICS_FILE).open("a") as file:
+                file.write(json.dumps(row) + "\n")
+            yield row
+
+    def _compile(self) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
+        task, config = self.task, self.config
+        chunk = learner.make_train(config.learner, self.model, config.chunk_updates)
+        share = jnp.zeros(2, jnp.float32)
+        return chunk.lower(self.state, share, task.train_words, task.train_params).compile()
+
+    def _row(self, metrics: dict[str, np.ndarray], took: float) -> Row:
+        """One line of `metrics.jsonl`: means over the chunk's episodes and steps."""
+        steps = self.config.chunk_updates * self.config.steps_per_update
+        episodes = int(metrics["episodes"].sum())
+        per_episode = 1 / max(episodes, 1)
+        mean = {k: float(metrics[k].mean()) for k in _UPDATE_MEANS}
+        return {
+            "updates": int(self.state.updates),
+            "steps": self.steps,
+            "episodes": int(self.state.episodes),
+            "success": float(metrics["success_sum"].sum()) * per_episode,
+            "spl": float(metrics["spl_sum"].sum()) * per_episode,
+            "length": float(metrics["length_sum"].sum()) * per_episode,
+            "reward": float(metrics["reward_sum"].sum()) / steps,
+            **mean,
+            "skipped": int(self.state.skipped),
+            "seconds": round(self.seconds, 3),
+            "steps_per_second": round(steps / took, 1),
+        }
+
+    def _drop_rows_after(self, updates: int) -> None:
+        """Rows behind the checkpoint belong to updates that will be done again."""
+        path = self.folder / METRICS_FILE
+        if path.exists():
+            kept = [row for row in read_metrics(self.folder) if row["updates"] <= updates]
+            path.write_text("".join(json.dumps(row) + "\n" for row in kept))
+
+
+_UPDATE_MEANS = ("policy_loss", "value_loss", "entropy", "grad_norm")
+
+
+def read_metrics(folder: Path) -> list[Row]:
+    """The rows of a run's `metrics.jsonl`; a last line that was cut short is left out."""
+    rows = []
+    for line in (folder / METRICS_FILE).read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return rows
