@@ -103,32 +103,48 @@ def make_params(
     Raises:
       ValueError: no episode is possible.
     """
-    if merge:
-        rows = tables.merged()
-        start, classes, corners = rows.start, rows.object_class, rows.box
-    else:
-        start, classes, corners = tables.row_start, tables.row_class, tables.row_box
-    longest = int(np.diff(start).max(initial=0))
-    boxes = corners.astype(np.float32) / (tables.image * tables.subpixel)
-    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
-    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-    pad = max(longest, 1)  # rows behind the last pose, so that a window of K never leaves the table
+    start, classes, boxes = _detections(tables, merge)
+    longest = max(int(np.diff(start).max(initial=0)), 1)
+    pad = (0, longest)  # rows behind the last pose, so that a window of K never leaves the table
     position_room = tables.room_type[tables.position_scene]
     return EnvParams(
         next_position=jnp.asarray(tables.next_position, jnp.int32),
         position_room=jnp.asarray(position_room, jnp.int8),
         row_start=jnp.asarray(start, jnp.int32),
-        row_class=jnp.asarray(np.pad(classes.astype(np.int32), (0, pad))),
-        row_box=jnp.asarray(np.pad(np.column_stack([centre, area]), ((0, pad), (0, 0)))),
+        row_class=jnp.asarray(np.pad(classes.astype(np.int32), pad)),
+        row_box=jnp.asarray(np.pad(boxes, (pad, (0, 0)))),
         visible=jnp.asarray(tables.visible_bits(), jnp.uint32),
         distance=jnp.asarray(tables.distance, jnp.int16),
         target_class=jnp.asarray([tables.classes.index(t) for t in tables.targets], jnp.int32),
         parent_class=jnp.asarray(parents.classes, jnp.int32),
         parent_reward=jnp.asarray(parents.reward, jnp.float32),
         step_limit=jnp.asarray(step_limits, jnp.int32),
-        max_detections=max(longest, 1),
+        max_detections=longest,
         **{name: jnp.asarray(v, jnp.int32) for name, v in _episode_pool(tables, targets).items()},
     )
+
+
+def _detections(tables: SceneTables, merge: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Detections of all poses: start [S + 1], class [N] and (x, y, S) [N, 3] float32.
+
+    Merged, a class's instances are one row: the centre is the mean of their boxes' corners, S the
+    extent over all of them, as in the code of MJOLNIR and SSNet.
+    """
+    corners = tables.row_box.astype(np.float64) / (tables.image * tables.subpixel)
+    centre = (corners[:, :2] + corners[:, 2:]) / 2
+    start, classes = tables.row_start, tables.row_class
+    if merge:
+        key = tables.row_state.astype(np.int64) * len(tables.classes) + tables.row_class
+        first = np.flatnonzero(np.diff(key, prepend=-1))
+        if first.size:
+            members = np.diff(first, append=len(key))[:, None]
+            centre = np.add.reduceat(centre, first) / members
+            least = np.minimum.reduceat(corners[:, :2], first)
+            corners = np.hstack([least, np.maximum.reduceat(corners[:, 2:], first)])
+        classes = classes[first]
+        start = np.searchsorted(first, tables.row_start)
+    area = (corners[:, 2] - corners[:, 0]) * (corners[:, 3] - corners[:, 1])
+    return start, classes, np.column_stack([centre, area]).astype(np.float32)
 
 
 def _episode_pool(

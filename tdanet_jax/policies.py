@@ -45,7 +45,8 @@ def shortest_path() -> Policy:
     ) -> tuple[Any, jax.Array]:
         poses = move(params, state.pose, jnp.arange(NUM_ACTIONS))  # [B, 6]
         distance = params.distance[poses, state.target[:, None]].astype(jnp.int32)
-        distance = distance.at[:, Action.DONE].set(jnp.iinfo(jnp.int32).max)
+        far = jnp.iinfo(jnp.int32).max
+        distance = jnp.where(distance < 0, far, distance).at[:, Action.DONE].set(far)
         here = params.distance[state.pose, state.target]
         return memory, jnp.where(here == 0, Action.DONE, jnp.argmin(distance, axis=-1))
 

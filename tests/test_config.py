@@ -1,0 +1,69 @@
+"""Configurations: defaults, presets, JSON and errors."""
+
+import dataclasses
+import json
+import re
+
+import pytest
+
+from tdanet_jax import config as configs
+from tdanet_jax.config import PAPER, LearnerConfig, NetworkConfig, TrainConfig
+
+
+def test_json_round_trip_is_the_identity():
+    for config in configs.PRESETS.values():
+        assert configs.from_json(json.loads(json.dumps(configs.to_json(config)))) == config
+
+
+def test_paper_preset_has_the_reference_constants():
+    learner = PAPER.learner
+    assert (learner.gamma, learner.gae_lambda, learner.entropy_weight) == (0.99, 1.0, 0.01)
+    assert (learner.learning_rate, learner.amsgrad, learner.max_grad_norm) == (1e-4, True, 100.0)
+    assert (learner.step_limit, learner.value_weight) == (30, 0.5)
+    assert PAPER.episodes == 6_000_000
+    assert PAPER.network.rows == "object"
+
+
+@pytest.mark.parametrize(
+    ("config", "flag"),
+    [
+        (TrainConfig(split="17/5"), "--split 17/5"),
+        (TrainConfig(model="cnn"), "--model cnn"),
+        (TrainConfig(steps=0), "--steps 0"),
+        (TrainConfig(minutes=-1.0), "--minutes -1.0"),
+        (TrainConfig(learner=LearnerConfig(num_envs=0)), "--num-envs 0"),
+        (TrainConfig(learner=LearnerConfig(gamma=1.5)), "--gamma 1.5"),
+        (TrainConfig(network=NetworkConfig(dropout=1.0)), "--dropout 1.0"),
+        (TrainConfig(learner=LearnerConfig(learning_rate=float("nan"))), "--learning-rate nan"),
+    ],
+)
+def test_a_value_out_of_range_is_named_in_one_line(config, flag):
+    with pytest.raises(ValueError, match=re.escape(flag)) as caught:
+        config.check()
+    assert "\n" not in str(caught.value)
+
+
+def test_every_default_is_in_range():
+    for config in configs.PRESETS.values():
+        config.check()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"split": "18/4"}'])
+def test_an_unreadable_config_file_is_named(tmp_path, text):
+    path = tmp_path / "config.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=re.escape(str(path))):
+        configs.load(path)
+
+
+def test_an_unknown_field_is_refused(tmp_path):
+    path = tmp_path / "config.json"
+    values = configs.to_json(TrainConfig()) | {"wings": 2}
+    path.write_text(json.dumps(values))
+    with pytest.raises(ValueError, match="wings"):
+        configs.load(path)
+
+
+def test_configs_are_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        TrainConfig().seed = 1

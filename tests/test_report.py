@@ -1,0 +1,78 @@
+"""The shape of results.json, the records beside it, and the page."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tdanet_jax import report
+from tdanet_jax.episodes import Episodes
+from tdanet_jax.evaluation import Records
+from tdanet_jax.vocabulary import ALL_TARGETS
+
+BUCKET = {"SR", "SPL", "SR_ci", "SPL_ci", "n"}
+TOP = [
+    "version", "split", "model", "policy", "episodes_trained", "seen", "unseen", "by_room",
+    "by_target", "seed", "steps", "data_version", "commit",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def played(tables):
+    """Three episodes a group, from real rooms: one success in four actions, two failures."""
+    goal = ALL_TARGETS.index("Mug")
+    reach = np.flatnonzero((tables.distance[:, goal] == 3) & (tables.state_scene < 30))
+    episodes = Episodes(reach[:3].astype(np.int32), np.full(3, goal, np.int32))
+    actions = np.full((3, 200), -1, np.int8)
+    actions[:, :4] = [[0, 1, 2, 5], [0, 0, 0, 5], [3, 4, 1, 5]]
+    actions[0, 4:8] = -1
+    records = Records(
+        shortest=np.array([4, 4, 4]),
+        length=np.array([4, 4, 4]),
+        success=np.array([True, False, False]),
+        actions=actions,
+    )
+    return {"seen": (episodes, records)}
+
+
+@pytest.fixture
+def written(played, tables, tmp_path):
+    provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 200, tables.data_version)
+    return tmp_path, report.write(tmp_path, provenance, tables, played)
+
+
+def test_results_have_the_documented_shape(written):
+    folder, out = written
+    assert json.loads((folder / "results.json").read_text()) == out
+    assert list(out) == TOP
+    assert out["unseen"] is None
+    assert set(out["seen"]) == {"L>=1", "L>=5"}
+    assert set(out["seen"]["L>=1"]) == BUCKET
+    assert out["by_room"] == {"kitchen": {"seen": out["seen"]}}
+    assert out["by_target"] == {"Mug": {"seen": out["seen"]}}
+
+
+def test_percentages_run_from_0_to_100_and_an_empty_bucket_is_null(written):
+    _, out = written
+    assert out["seen"]["L>=1"]["SR"] == pytest.approx(100 / 3, abs=0.01)
+    assert out["seen"]["L>=1"]["SPL"] == pytest.approx(100 / 3, abs=0.01)
+    assert out["seen"]["L>=5"] == {"SR": None, "SPL": None, "SR_ci": None, "SPL_ci": None, "n": 0}
+
+
+def test_one_record_per_episode(written, played, tables):
+    folder, _ = written
+    rows = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    assert len(rows) == 3
+    first = rows[0]
+    assert first["actions"] == ["MoveAhead", "RotateLeft", "RotateRight", "Done"]
+    assert (first["L"], first["e"], first["success"], first["target"]) == (4, 4, True, "Mug")
+    pose = played["seen"][0].pose[0]
+    assert first["scene"] == tables.scenes[tables.state_scene[pose]]
+    assert first["rotation"] == 45 * (pose // 2 % 8)
+
+
+def test_the_page_shows_the_paper_beside_ours_and_says_that_the_worlds_differ(written):
+    page = (written[0] / "results.md").read_text()
+    assert "TDANet (paper) | 74.7 | 29.7" in page
+    assert "The worlds differ" in page
+    assert "33.3" in page
