@@ -199,8 +199,6 @@ def test_what_is_in_view_but_beyond_reach_earns_nothing(params: env.EnvParams) -
 def test_a_parents_reward_is_the_one_of_its_own_target() -> None:
     objects = [(name, (0.0, 0.0, 0.0)) for name in ("Mug", "Apple", "Sink")]
     sightings = {handmade.state(0, 0): [Sighting(i) for i in range(3)]}
-    tables = tables_of(
-        [Room("kitchen", corridor(1), objects, sightings)], CLASSES, ["Apple", "Mug"]
     room = Room("kitchen", corridor(1), objects, sightings)
     tables = tables_of([room], CLASSES, ["Apple", "Mug"])
     sink = CLASSES.index("Sink")
