@@ -237,7 +237,7 @@ def update(
     (total, parts), grads = jax.value_and_grad(loss, has_aux=True)(
         state.params, steps, advantage, state.carry, entropy_weight, config, model, words
     )
-    grad_norm = optax.global_norm(grads)
+    grad_norm = optax.tree.norm(grads)
     finite = jnp.isfinite(total) & jnp.isfinite(grad_norm)
     scaled, opt_state = make_optimizer(config).update(grads, state.opt_state, state.params)
     rate = mix(config.learning_rate, config.final_learning_rate)

@@ -90,9 +90,12 @@ class Run:
         keeps what is done.
         """
         chunk = self._compile()
-        pace = 0.0  # share of the budget per chunk, as the last one went
         while self.progress < 1.0:
             before = self.progress
+            # The chunk is taken to go as those before it did: known from the state alone, so that
+            # a run that was stopped goes on with the same schedule.
+            chunks_done = int(self.state.updates) / self.config.chunk_updates
+            pace = before / chunks_done if chunks_done else 0.0
             share = jnp.array([before, min(1.0, before + pace)], jnp.float32)
             began = time.perf_counter()
             self.state, metrics = chunk(
@@ -101,7 +104,6 @@ class Run:
             metrics = jax.device_get(metrics)
             took = time.perf_counter() - began
             self.seconds += took
-            pace = self.progress - before
             row = self._row(metrics, took)
             with (self.folder / METRICS_FILE).open("a") as file:
                 file.write(json.dumps(row) + "\n")

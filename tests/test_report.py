@@ -18,10 +18,10 @@ TOP = [
 
 
 @pytest.fixture(scope="module")
-def played(tables):
+def played(ithor):
     """Three episodes a group, from real rooms: one success in four actions, two failures."""
     goal = ALL_TARGETS.index("Mug")
-    reach = np.flatnonzero((tables.distance[:, goal] == 3) & (tables.state_scene < 30))
+    reach = np.flatnonzero((ithor.distance[:, goal] == 3) & (ithor.state_scene < 30))
     episodes = Episodes(reach[:3].astype(np.int32), np.full(3, goal, np.int32))
     actions = np.full((3, 200), -1, np.int8)
     actions[:, :4] = [[0, 1, 2, 5], [0, 0, 0, 5], [3, 4, 1, 5]]
@@ -36,9 +36,9 @@ def played(tables):
 
 
 @pytest.fixture
-def written(played, tables, tmp_path):
-    provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 200, tables.data_version)
-    return tmp_path, report.write(tmp_path, provenance, tables, played)
+def written(played, ithor, tmp_path):
+    provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 200, ithor.data_version)
+    return tmp_path, report.write(tmp_path, provenance, ithor, played)
 
 
 def test_results_have_the_documented_shape(written):
@@ -59,7 +59,7 @@ def test_percentages_run_from_0_to_100_and_an_empty_bucket_is_null(written):
     assert out["seen"]["L>=5"] == {"SR": None, "SPL": None, "SR_ci": None, "SPL_ci": None, "n": 0}
 
 
-def test_one_record_per_episode(written, played, tables):
+def test_one_record_per_episode(written, played, ithor):
     folder, _ = written
     rows = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
     assert len(rows) == 3
@@ -67,7 +67,7 @@ def test_one_record_per_episode(written, played, tables):
     assert first["actions"] == ["MoveAhead", "RotateLeft", "RotateRight", "Done"]
     assert (first["L"], first["e"], first["success"], first["target"]) == (4, 4, True, "Mug")
     pose = played["seen"][0].pose[0]
-    assert first["scene"] == tables.scenes[tables.state_scene[pose]]
+    assert first["scene"] == ithor.scenes[ithor.state_scene[pose]]
     assert first["rotation"] == 45 * (pose // 2 % 8)
 
 

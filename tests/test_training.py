@@ -1,0 +1,117 @@
+"""A run on disk: budget, metrics, checkpoints, and going on bit for bit after a stop."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from tdanet_jax import words
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.task import make_task
+from tdanet_jax.training import Run, read_metrics
+
+#: Eight chunks of two updates of 8 x 5 steps.
+TINY = TrainConfig(
+    steps=640,
+    chunk_updates=2,
+    learner=LearnerConfig(num_envs=8, rollout_steps=5, step_limit=6),
+    network=NetworkConfig(width=16, hidden=16),
+)
+TIMES = {"seconds", "steps_per_second"}
+
+
+@pytest.fixture(scope="module")
+def task(ithor):
+    return make_task(TINY, ithor, words.load_bundled())
+
+
+def leaves(state):
+    plain = state.replace(key=jax.random.key_data(state.key))
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(plain)]
+
+
+def without_times(rows):
+    return [{k: v for k, v in row.items() if k not in TIMES} for row in rows]
+
+
+@pytest.fixture(scope="module")
+def whole(task, tmp_path_factory):
+    """A run that nothing interrupted."""
+    folder = tmp_path_factory.mktemp("whole")
+    run = Run(folder, TINY, task)
+    rows = list(run.chunks())
+    run.save()
+    return folder, run, rows
+
+
+def test_the_budget_in_steps_is_kept_and_every_chunk_has_a_row(whole):
+    folder, run, rows = whole
+    assert run.steps == 640
+    assert [row["steps"] for row in rows] == list(range(80, 641, 80))
+    assert read_metrics(folder) == rows
+    assert rows[-1]["episodes"] == int(run.state.episodes) > 0
+
+
+def test_a_stopped_run_goes_on_bit_for_bit(whole, task, tmp_path):
+    stopped = Run(tmp_path, TINY, task)
+    for count, _ in enumerate(stopped.chunks(), start=1):
+        if count == 3:
+            stopped.save()
+        if count == 5:  # two chunks behind the checkpoint are lost
+            break
+    again = Run(tmp_path, TINY, task)
+    assert again.steps == 240
+    list(again.chunks())
+    for ours, theirs in zip(leaves(again.state), leaves(whole[1].state), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert without_times(read_metrics(tmp_path)) == without_times(whole[2])
+
+
+def test_a_finished_run_has_nothing_left_to_do(whole, task):
+    again = Run(whole[0], TINY, task)
+    assert list(again.chunks()) == []
+    assert again.progress >= 1
+
+
+def test_another_seed_gives_another_run(whole, task, tmp_path):
+    other = Run(tmp_path, dataclasses.replace(TINY, seed=1), task)
+    rows = [next(other.chunks())]
+    assert without_times(rows) != without_times(whole[2][:1])
+
+
+def test_the_budget_in_episodes_ends_the_run(task, tmp_path):
+    run = Run(tmp_path, dataclasses.replace(TINY, episodes=5), task)
+    list(run.chunks())
+    assert int(run.state.episodes) >= 5
+    assert run.steps < 640
+
+
+def test_a_damaged_checkpoint_is_one_clear_line(whole, task, tmp_path):
+    run = Run(tmp_path, TINY, task)
+    next(run.chunks())
+    run.save()
+    for file in (tmp_path / "checkpoints").rglob("*"):
+        if file.is_file() and file.stat().st_size > 1000:
+            file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(ValueError, match="unreadable checkpoint") as caught:
+        Run(tmp_path, TINY, task)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_checkpoint_of_another_network_is_refused(whole, task):
+    wider = dataclasses.replace(TINY, network=NetworkConfig(width=24, hidden=16))
+    with pytest.raises(ValueError, match="unreadable checkpoint"):
+        Run(whole[0], wider, task)
+
+
+def test_a_checkpoint_of_other_tables_is_refused(whole, task, ithor):
+    moved = dataclasses.replace(ithor, camera_height=ithor.camera_height + 0.1)
+    with pytest.raises(ValueError, match="trained on scene tables"):
+        Run(whole[0], TINY, dataclasses.replace(task, tables=moved))
+
+
+def test_a_last_line_that_was_cut_short_is_left_out(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text(json.dumps({"updates": 1}) + '\n{"upda')
+    assert read_metrics(tmp_path) == [{"updates": 1}]
