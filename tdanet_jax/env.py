@@ -28,8 +28,7 @@ POSES_PER_POSITION = 16
 TEST_STEP_LIMITS = (100, 200, 100, 100)
 
 
-@struct.dataclass
-class EnvParams:
+class EnvParams(struct.PyTreeNode):
     """Everything that the environment reads: scene tables, rewards and the lists of episodes."""
 
     next_position: jax.Array  # [P, 8] int32, where MoveAhead leads, by heading
@@ -52,8 +51,7 @@ class EnvParams:
     max_detections: int = struct.field(pytree_node=False)  # K, most detections in any pose
 
 
-@struct.dataclass
-class EnvState:
+class EnvState(struct.PyTreeNode):
     """One episode in progress."""
 
     pose: jax.Array  # int32, (position * 8 + rotation) * 2 + horizon
@@ -63,8 +61,7 @@ class EnvState:
     shortest: jax.Array  # int32, L: actions on the optimal path from the start, Done included
 
 
-@struct.dataclass
-class Observation:
+class Observation(struct.PyTreeNode):
     """What the agent perceives. A frame without detections is one all-zero row."""
 
     classes: jax.Array  # [K] int32, class of each detection; 0 in padding

@@ -9,7 +9,6 @@ Axis letters: T steps of a rollout, B environments, H units, K detections, C cla
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -20,14 +19,14 @@ from flax import struct
 from tdanet_jax import env
 from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import EnvParams, EnvState, Observation
+from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.layers import TAPE, Carry
+from tdanet_jax.models.layers import Carry
 from tdanet_jax.returns import advantages
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(struct.PyTreeNode):
     """All that a run needs to go on exactly where it was."""
 
     params: Any
@@ -112,18 +111,18 @@ def rollout(
     """
     observe = jax.vmap(env.observe, (0, None))
     transition = jax.vmap(env.transition, (0, 0, None))
-    weights = {"params": jax.tree.map(lambda x: x.astype(model.dtype) if x.ndim > 1 else x,
-                                      state.params)}  # fmt: skip
-    table = model.apply({"params": state.params}, words, method="prepare")
+    # Cast once per rollout what every step would cast.
+    weights = jax.tree.map(lambda x: x.astype(model.dtype) if x.ndim > 1 else x, state.params)
+    table = actor_critic.prepare(model, state.params, words)
     rate = model.encoder.dropout
     batch, width = state.fresh.shape[0], model.encoder.width
 
     def act(state: TrainState, step_key: jax.Array) -> tuple[TrainState, Rollout]:
         action_key, dropout_key, reset_key = jax.random.split(step_key, 3)
         obs = observe(state.env_state, params)
-        keep = jax.random.bernoulli(dropout_key, 1 - rate, (batch, width)) if rate else None
-        (carry, out), recorded = model.apply(
-            weights, table, state.carry, obs, state.previous, state.fresh, keep, mutable=[TAPE]
+        keep = _keep(dropout_key, rate, (batch, width)) if rate else None
+        carry, out, tape = actor_critic.record(
+            model, weights, table, state.carry, obs, state.previous, state.fresh, keep
         )
         log_probs = jax.nn.log_softmax(out.logits)
         action = jax.random.categorical(action_key, out.logits)
@@ -139,7 +138,7 @@ def rollout(
             previous=state.previous,
             fresh=state.fresh,
             keep=keep,
-            tape=recorded[TAPE],
+            tape=tape,
             action=action,
             log_prob=jnp.take_along_axis(log_probs, action[:, None], -1)[:, 0],
             value=out.value,
@@ -162,8 +161,15 @@ def rollout(
 
     after, steps = jax.lax.scan(act, state, jax.random.split(key, config.rollout_steps))
     obs = observe(after.env_state, params)
-    _, out = model.apply(weights, table, after.carry, obs, after.previous, after.fresh)
+    _, out = actor_critic.forward(
+        model, weights, table, after.carry, obs, after.previous, after.fresh
+    )
     return after, steps, out.value
+
+
+def _keep(key: jax.Array, rate: float, shape: tuple[int, ...]) -> jax.Array:
+    """Which units dropout keeps; the rate is rounded to 1/256, for a quarter of the random bits."""
+    return jax.random.bits(key, shape, jnp.uint8) >= round(256 * rate)
 
 
 def loss(
@@ -180,16 +186,9 @@ def loss(
 
     The network's values are those recorded while acting; only the gradients are new work.
     """
-    table = model.apply({"params": weights}, words, method="prepare")
-    _, out = model.apply(
-        {"params": weights, TAPE: steps.tape},
-        table,
-        carry,
-        steps.obs,
-        steps.previous,
-        steps.fresh,
-        steps.keep,
-    )
+    table = actor_critic.prepare(model, weights, words)
+    seen = (steps.obs, steps.previous, steps.fresh, steps.keep)
+    _, out = actor_critic.forward(model, weights, table, carry, *seen, tape=steps.tape)
     counted = ~steps.held
     count = counted.sum()
 
@@ -274,15 +273,11 @@ def _episode_sums(steps: Rollout) -> dict[str, jax.Array]:
     }
 
 
-#: (state, progress before and after) -> (state, metrics stacked over the updates).
-TrainChunk = Callable[..., tuple[TrainState, dict[str, jax.Array]]]
-
-
-def make_train(config: LearnerConfig, model: ActorCritic, updates: int) -> TrainChunk:
+def make_train(config: LearnerConfig, model: ActorCritic, updates: int) -> jax.stages.Wrapped:
     """Compiles `updates` updates into one call: `chunk(state, progress, words, params)`.
 
-    `progress` is a pair, the share of the budget spent before and after the chunk. The state's
-    buffers are donated.
+    `progress` is a pair, the share of the budget spent before and after the chunk. The call
+    returns the state and the metrics, stacked over the updates. The state's buffers are donated.
     """
 
     def chunk(

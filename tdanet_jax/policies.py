@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from tdanet_jax import env
 from tdanet_jax.env import EnvParams, EnvState
+from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action
 
@@ -58,7 +59,7 @@ def network(model: ActorCritic, words: jax.Array, greedy: bool = False) -> Polic
     observe = jax.vmap(env.observe, (0, None))
 
     def start(weights: Any, batch: int) -> Any:
-        table = model.apply({"params": weights}, words, method="prepare")
+        table = actor_critic.prepare(model, weights, words)
         previous, fresh = jnp.zeros((batch, NUM_ACTIONS)), jnp.ones(batch, bool)
         return table, model.initial_carry(batch), previous, fresh
 
@@ -67,7 +68,7 @@ def network(model: ActorCritic, words: jax.Array, greedy: bool = False) -> Polic
     ) -> tuple[Any, jax.Array]:
         table, carry, previous, fresh = memory
         obs = observe(state, params)
-        carry, out = model.apply({"params": weights}, table, carry, obs, previous, fresh)
+        carry, out = actor_critic.forward(model, weights, table, carry, obs, previous, fresh)
         sampled = jax.random.categorical(key, out.logits)
         action = jnp.argmax(out.logits, axis=-1) if greedy else sampled
         probs = jax.nn.softmax(out.logits)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +109,7 @@ class Run:
                 file.write(json.dumps(row) + "\n")
             yield row
 
-    def _compile(self) -> Callable[..., tuple[TrainState, dict[str, jax.Array]]]:
+    def _compile(self) -> jax.stages.Compiled:
         task, config = self.task, self.config
         chunk = learner.make_train(config.learner, self.model, config.chunk_updates)
         share = jnp.zeros(2, jnp.float32)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 from tdanet_jax.env import Observation
-from tdanet_jax.models.layers import LSTM, Carry, Linear
+from tdanet_jax.models.layers import LSTM, TAPE, Carry, Linear
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
 
@@ -91,3 +91,41 @@ class ActorCritic(nn.Module):
             return module(table, module.initial_carry(1), blank, previous, fresh)[1]
 
         return nn.init(everything, self)(key)["params"]
+
+
+def prepare(model: ActorCritic, weights: Any, words: jax.Array) -> Any:
+    """The table of classes of these weights, from word vectors [C, D]."""
+    return model.apply({"params": weights}, words, method="prepare")
+
+
+def forward(
+    model: ActorCritic,
+    weights: Any,
+    table: Any,
+    carry: Carry,
+    obs: Observation,
+    previous: jax.Array,
+    fresh: jax.Array,
+    keep: jax.Array | None = None,
+    tape: Any = None,
+) -> tuple[Carry, Output]:
+    """`ActorCritic.__call__` with these weights; with a `tape`, products are taken from there."""
+    variables = {"params": weights} if tape is None else {"params": weights, TAPE: tape}
+    out: Any = model.apply(variables, table, carry, obs, previous, fresh, keep)
+    return out
+
+
+def record(
+    model: ActorCritic,
+    weights: Any,
+    table: Any,
+    carry: Carry,
+    obs: Observation,
+    previous: jax.Array,
+    fresh: jax.Array,
+    keep: jax.Array | None = None,
+) -> tuple[Carry, Output, Any]:
+    """`forward` of one step, and the tape that it recorded."""
+    arguments = (table, carry, obs, previous, fresh, keep)
+    (after, out), variables = model.apply({"params": weights}, *arguments, mutable=[TAPE])
+    return after, out, variables[TAPE]

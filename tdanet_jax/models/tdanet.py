@@ -28,8 +28,7 @@ from tdanet_jax.models.layers import Linear
 TARGET_BOX = (0.5, 0.5, 0.25)
 
 
-@struct.dataclass
-class ClassTable:
+class ClassTable(struct.PyTreeNode):
     """What is known of a class before any frame is seen. First axis C_t: the class as target."""
 
     words: jax.Array  # [C, D], word vector of each class
