@@ -1,0 +1,149 @@
+"""The network as printed: Eqs. 1 and 2 of the paper, one frame at a time, no table, no tape.
+
+Every function takes the array module first: NumPy for golden values in float64, `jax.numpy` for
+gradients of the plain form.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+TARGET_BOX = (0.5, 0.5, 0.25)
+
+Params = Any
+Array = Any
+
+
+def relu(xp: Any, x: Array) -> Array:
+    return xp.maximum(x, 0.0)
+
+
+def sigmoid(xp: Any, x: Array) -> Array:
+    return 1 / (1 + xp.exp(-x))
+
+
+def linear(layer: Params, x: Array) -> Array:
+    return x @ layer["kernel"] + layer["bias"]
+
+
+def softmax(xp: Any, logits: Array) -> Array:
+    weights = xp.exp(logits - logits.max())
+    return weights / weights.sum()
+
+
+def attention(xp: Any, params: Params, rows: Array, target: Array) -> Array:
+    """Weights of the K detections [K, 3 + D] of a frame for a target row [3 + D]."""
+    query = linear(params["attention"], target)
+    return softmax(xp, linear(params["attention"], rows) @ query)
+
+
+def encode(
+    xp: Any,
+    params: Params,
+    rows: Array,
+    word: Array,
+    *,
+    target_attention: bool = True,
+    siamese: bool = True,
+    dropped: Array | None = None,
+    dropout: float = 0.25,
+) -> Array:
+    """Features of one frame.
+
+    Args:
+      rows: [K, 3 + D] detections (x, y, S, word vector), K at least 1: a frame without any has one
+        all-zero row.
+      word: [D], the target's word vector.
+      dropped: [H] bool, units that dropout zeroes.
+    """
+    target = xp.concatenate([xp.array(TARGET_BOX), word])
+    projected = linear(params["linear1"], rows)  # M_L1
+    if target_attention:
+        pooled = attention(xp, params, rows, target) @ projected  # V_L1 = V_att M_L1
+    else:
+        pooled = projected.mean(axis=0)
+    features = relu(xp, linear(params["linear2"], relu(xp, pooled)))
+    if siamese:
+        first = relu(xp, linear(params["linear1"], target))
+        features = xp.abs(features - relu(xp, linear(params["linear2"], first)))
+    if dropped is not None:
+        features = xp.where(dropped, 0.0, features / (1 - dropout))
+    if not siamese and not target_attention:
+        features = xp.concatenate([features, word])
+    hidden = relu(xp, linear(params["linear3"], features))
+    return relu(xp, linear(params["linear4"], hidden))
+
+
+def lstm(xp: Any, params: Params, hidden: Array, cell: Array, x: Array) -> tuple[Array, Array]:
+    """One step, with the gates in the order i, f, g, o and two biases."""
+    kernel = params["kernel"]
+    z = x @ kernel[: x.shape[-1]] + params["bias_ih"]
+    z = z + hidden @ kernel[x.shape[-1] :] + params["bias_hh"]
+    i, f, g, o = xp.split(z, 4, axis=-1)
+    cell = sigmoid(xp, f) * cell + sigmoid(xp, i) * xp.tanh(g)
+    return sigmoid(xp, o) * xp.tanh(cell), cell
+
+
+def lstm_rollout(
+    xp: Any, params: Params, hidden: Array, cell: Array, x: Array, fresh: Array
+) -> tuple[Array, tuple[Array, Array]]:
+    """Hidden states [T, B, H] of T steps and the last carry; the carry is zero where fresh."""
+    out = []
+    for x_t, fresh_t in zip(x, fresh, strict=True):
+        hidden = xp.where(fresh_t[:, None], 0.0, hidden)
+        cell = xp.where(fresh_t[:, None], 0.0, cell)
+        hidden, cell = lstm(xp, params, hidden, cell, x_t)
+        out.append(hidden)
+    return xp.stack(out), (hidden, cell)
+
+
+def frames(obs: Any, words: Array) -> list[tuple[Array, Array]]:
+    """Detection rows and target word of each frame of a flat batch of observations."""
+    found = []
+    for classes, boxes, mask, target in zip(
+        obs.classes, obs.boxes, obs.mask, obs.target, strict=True
+    ):
+        rows = [
+            np.concatenate([box, words[cls]])
+            for cls, box, valid in zip(
+                np.asarray(classes), np.asarray(boxes), np.asarray(mask), strict=True
+            )
+            if valid
+        ]
+        found.append((np.array(rows or [np.zeros(3 + words.shape[1])]), words[int(target)]))
+    return found
+
+
+def actor_critic(
+    xp: Any,
+    params: Params,
+    frames: list[list[tuple[Array, Array]]],
+    previous: Array,
+    carry: tuple[Array, Array],
+    fresh: Array,
+    dropped: Array | None = None,
+    **encoder: Any,
+) -> tuple[Array, Array]:
+    """Logits [T, B, 6] and values [T, B] of a rollout of frames[t][b]."""
+    inputs = []
+    for t, row in enumerate(frames):
+        features = [
+            encode(
+                xp, params["encoder"], *frame,
+                dropped=None if dropped is None else dropped[t, b], **encoder,
+            )
+            for b, frame in enumerate(row)
+        ]  # fmt: skip
+        action = relu(xp, linear(params["action_embedding"], previous[t]))
+        inputs.append(xp.concatenate([xp.stack(features), action], axis=-1))
+    hidden, _ = lstm_rollout(xp, params["lstm"], *carry, xp.stack(inputs), fresh)
+    return linear(params["actor"], hidden), linear(params["critic"], hidden)[..., 0]
+
+
+def in_float64(params: Params) -> Params:
+    """The parameters as NumPy arrays of double precision."""
+    if hasattr(params, "items"):
+        return {name: in_float64(value) for name, value in params.items()}
+    return np.asarray(params, np.float64)

@@ -1,0 +1,51 @@
+"""Random observations and parameters for the networks' tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tdanet_jax.env import Observation
+
+CLASSES, WIDTH, DETECTIONS = 9, 5, 6  # C, D, K
+
+
+def words(seed: int = 0) -> np.ndarray:
+    """Word vectors [C, D]."""
+    return np.random.default_rng(seed).normal(size=(CLASSES, WIDTH)).astype(np.float32)
+
+
+def observations(*shape: int, seed: int = 1) -> Observation:
+    """Frames with 0 to K detections, in [*shape]; the first is empty, the last full."""
+    rng = np.random.default_rng(seed)
+    count = rng.integers(0, DETECTIONS + 1, shape)
+    count.flat[0], count.flat[-1] = 0, DETECTIONS
+    mask = np.arange(DETECTIONS) < count[..., None]
+    boxes = rng.random((*shape, DETECTIONS, 3)).astype(np.float32)
+    classes = rng.integers(0, CLASSES, (*shape, DETECTIONS))
+    return Observation(
+        classes=jnp.asarray(np.where(mask, classes, 0), jnp.int32),
+        boxes=jnp.asarray(np.where(mask[..., None], boxes, 0)),
+        mask=jnp.asarray(mask),
+        target=jnp.asarray(rng.integers(0, CLASSES, shape), jnp.int32),
+        empty=jnp.asarray(count == 0),
+    )
+
+
+def randomised(params: Any, seed: int = 2) -> Any:
+    """Parameters of the same shapes with nothing at zero, biases included."""
+    leaves, tree = jax.tree.flatten(params)
+    rng = np.random.default_rng(seed)
+    new = [
+        rng.normal(size=x.shape).astype(np.float32) / np.sqrt(max(x.shape[0], 1)) for x in leaves
+    ]
+    return jax.tree.unflatten(tree, [jnp.asarray(x) for x in new])
+
+
+def flat(obs: Observation) -> Observation:
+    """The observations of a rollout [T, B, ...] as one batch [T B, ...]."""
+    lead = obs.empty.ndim
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[lead:]), obs)

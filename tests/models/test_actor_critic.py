@@ -1,0 +1,194 @@
+"""The recurrent actor-critic around TDANet's encoder."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tdanet_jax.env import Observation
+from tdanet_jax.models.actor_critic import ActorCritic, Output
+from tdanet_jax.models.layers import TAPE, Carry
+from tdanet_jax.models.tdanet import TDANetEncoder
+from tests.models import equations, samples
+from tests.models.samples import observations
+
+T, B, H = 3, 2, 6
+CLOSE = {"rtol": 5e-5, "atol": 5e-6}  # float32 sums in another order, over three steps
+WORDS = jnp.asarray(samples.words())
+
+
+def network(**encoder: Any) -> ActorCritic:
+    return ActorCritic(TDANetEncoder(7, **encoder), hidden=H, action_width=4)
+
+
+@functools.cache
+def parameters() -> Any:
+    return samples.randomised(network().initialise(jax.random.key(0), WORDS))
+
+
+def inputs(seed: int = 0) -> tuple[Carry, Observation, jax.Array, jax.Array, jax.Array]:
+    """Carry, observations, previous probabilities, episode starts and dropout of a rollout."""
+    rng = np.random.default_rng(seed)
+    fresh = rng.random((T, B)) < 0.3
+    previous = np.where(fresh[..., None], 0, rng.dirichlet(np.ones(6), (T, B)))
+    carry = tuple(jnp.asarray(rng.normal(size=(B, H)), jnp.float32) for _ in range(2))
+    keep = jnp.asarray(rng.random((T, B, 7)) < 0.75)
+    obs = observations(T, B, seed=seed)
+    return carry, obs, jnp.asarray(previous, jnp.float32), jnp.asarray(fresh), keep
+
+
+def forward(params: Any, carry: Carry, obs: Observation, *rest: Any) -> tuple[Carry, Output]:
+    module = network()
+    table = module.apply({"params": params}, WORDS, method="prepare")
+    return module.apply({"params": params}, table, carry, obs, *rest)
+
+
+def plain(xp: Any, params: Any, seed: int = 0) -> tuple[Any, Any]:
+    """The printed equations on the same inputs."""
+    carry, obs, previous, fresh, keep = inputs(seed)
+    frames = [
+        [
+            (xp.asarray(rows), xp.asarray(word))
+            for rows, word in equations.frames(row, np.asarray(WORDS))
+        ]
+        for row in (jax.tree.map(lambda x, t=t: x[t], obs) for t in range(T))
+    ]
+    arrays = [xp.asarray(x) for x in (previous, *carry, fresh, keep)]
+    return equations.actor_critic(
+        xp, params, frames, arrays[0], (arrays[1], arrays[2]), arrays[3], ~arrays[4]
+    )
+
+
+def test_logits_and_values_are_those_of_the_printed_equations() -> None:
+    carry, obs, previous, fresh, keep = inputs()
+    _, out = forward(parameters(), carry, obs, previous, fresh, keep)
+    logits, value = plain(np, equations.in_float64(parameters()))
+    assert out.logits.shape == (T, B, 6)
+    assert out.value.shape == (T, B)
+    np.testing.assert_allclose(out.logits, logits, **CLOSE)
+    np.testing.assert_allclose(out.value, value, **CLOSE)
+
+
+def test_the_gradient_with_a_tape_is_that_of_the_printed_equations() -> None:
+    carry, obs, previous, fresh, keep = inputs()
+    module, params = network(), parameters()
+    rng = np.random.default_rng(1)
+    mix = jnp.asarray(rng.normal(size=(T, B, 6)), jnp.float32)
+    tape = record(params, carry, obs, previous, fresh, keep)[1]
+
+    def fast(params: Any) -> jax.Array:
+        table = module.apply({"params": params}, WORDS, method="prepare")
+        _, out = module.apply(
+            {"params": params, TAPE: tape}, table, carry, obs, previous, fresh, keep
+        )
+        return (out.logits * mix).sum() + (out.value * mix[..., 0]).sum()
+
+    def slow(params: Any) -> jax.Array:
+        logits, value = plain(jnp, params)
+        return (logits * mix).sum() + (value * mix[..., 0]).sum()
+
+    chex.assert_trees_all_close(
+        jax.grad(fast)(params), jax.grad(slow)(params), rtol=1e-4, atol=2e-5
+    )
+
+
+def record(
+    params: Any, carry: Carry, obs: Observation, previous: jax.Array, fresh: jax.Array, keep: Any
+) -> tuple[Output, Any]:
+    """The outputs of T single steps and their tape."""
+    module = network()
+    table = module.apply({"params": params}, WORDS, method="prepare")
+
+    def act(carry: Carry, step: Any) -> Any:
+        (carry, out), tape = module.apply({"params": params}, table, carry, *step, mutable=[TAPE])
+        return carry, (out, tape[TAPE])
+
+    return jax.lax.scan(act, carry, (obs, previous, fresh, keep))[1]
+
+
+def test_a_rollout_equals_its_steps() -> None:
+    carry, *rest = inputs()
+    stepped, _ = record(parameters(), carry, *rest)
+    chex.assert_trees_all_close(forward(parameters(), carry, *rest)[1], stepped, **CLOSE)
+
+
+def test_a_fresh_episode_knows_nothing_of_the_carry() -> None:
+    carry, obs, previous, _, keep = inputs()
+    row = jax.tree.map(lambda x: x[0], (obs, previous))
+    fresh = jnp.ones(B, bool)
+    zero = network().initial_carry(B)
+    chex.assert_trees_all_equal(
+        forward(parameters(), carry, *row, fresh, keep[0]),
+        forward(parameters(), zero, *row, fresh, keep[0]),
+    )
+    assert not jnp.concatenate(zero).any()
+
+
+@pytest.mark.parametrize("part", ["carry", "previous"])
+def test_the_past_matters(part: str) -> None:
+    carry, obs, previous, _, keep = inputs()
+    obs, previous, keep = jax.tree.map(lambda x: x[0], (obs, previous, keep))
+    stale = jnp.zeros(B, bool)
+    other_carry = jax.tree.map(lambda x: x + 1, carry) if part == "carry" else carry
+    other_previous = jnp.roll(previous + 0.1, 1, axis=-1) if part == "previous" else previous
+    first = forward(parameters(), carry, obs, previous, stale, keep)[1]
+    second = forward(parameters(), other_carry, obs, other_previous, stale, keep)[1]
+    assert not np.allclose(first.logits, second.logits)
+
+
+def test_the_published_size() -> None:
+    # W_L and Linear1 303 x 512, three 512 x 512 layers, 6 -> 10, LSTM 522 -> 512 with two biases,
+    # actor and critic, every layer with its bias.
+    module = ActorCritic(TDANetEncoder())
+    shapes = jax.eval_shape(module.initialise, jax.random.key(0), jnp.zeros((22, 300)))
+    assert sum(np.prod(leaf.shape) for leaf in jax.tree.leaves(shapes)) == 3_224_653
+
+
+def test_the_number_of_classes_does_not_change_the_size() -> None:
+    sizes = [
+        jax.tree.map(jnp.shape, jax.eval_shape(network().initialise, jax.random.key(0), words))
+        for words in (jnp.zeros((5, 50)), jnp.zeros((118, 50)))
+    ]
+    assert sizes[0] == sizes[1]
+
+
+def test_a_new_policy_is_nearly_uniform_and_keys_decide_the_parameters() -> None:
+    params = [network().initialise(jax.random.key(k), WORDS) for k in (0, 0, 1)]
+    chex.assert_trees_all_equal(params[0], params[1])
+    assert not np.array_equal(
+        params[0]["encoder"]["linear1"]["kernel"], params[2]["encoder"]["linear1"]["kernel"]
+    )
+    carry, *rest = inputs()
+    probabilities = jax.nn.softmax(forward(params[0], carry, *rest)[1].logits)
+    np.testing.assert_allclose(probabilities, 1 / 6, atol=0.01)
+
+
+def test_all_parameters_get_a_gradient() -> None:
+    carry, *rest = inputs()
+
+    def loss(params: Any) -> jax.Array:
+        out = forward(params, carry, *rest)[1]
+        return (out.logits**2).sum() + (out.value**2).sum()
+
+    for path, leaf in jax.tree.leaves_with_path(jax.grad(loss)(parameters())):
+        assert np.asarray(leaf).any(), jax.tree_util.keystr(path)
+
+
+def test_a_bfloat16_network_is_close() -> None:
+    carry, *rest = inputs()
+    half = ActorCritic(
+        TDANetEncoder(7, dtype=jnp.bfloat16), hidden=H, action_width=4, dtype=jnp.bfloat16
+    )
+    table = half.apply({"params": parameters()}, WORDS, method="prepare")
+    _, out = half.apply({"params": parameters()}, table, carry, *rest)
+    _, full = forward(parameters(), carry, *rest)
+    for one, two in ((out.logits, full.logits), (out.value, full.value)):
+        assert one.dtype == jnp.float32
+        # Eight bits of mantissa through the encoder and three steps of the LSTM.
+        np.testing.assert_allclose(one, two, atol=0.05 * float(jnp.abs(two).max()))
