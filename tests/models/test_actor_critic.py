@@ -29,7 +29,7 @@ def network(**encoder: Any) -> ActorCritic:
 
 @functools.cache
 def parameters() -> Any:
-    return samples.randomised(network().initialise(jax.random.key(0), WORDS))
+    return samples.randomised(jax.jit(network().initialise)(jax.random.key(0), WORDS))
 
 
 def inputs(seed: int = 0) -> tuple[Carry, Observation, jax.Array, jax.Array, jax.Array]:
@@ -43,15 +43,16 @@ def inputs(seed: int = 0) -> tuple[Carry, Observation, jax.Array, jax.Array, jax
     return carry, obs, jnp.asarray(previous, jnp.float32), jnp.asarray(fresh), keep
 
 
+@jax.jit
 def forward(params: Any, carry: Carry, obs: Observation, *rest: Any) -> tuple[Carry, Output]:
     module = network()
     table = module.apply({"params": params}, WORDS, method="prepare")
     return module.apply({"params": params}, table, carry, obs, *rest)
 
 
-def plain(xp: Any, params: Any, seed: int = 0) -> tuple[Any, Any]:
-    """The printed equations on the same inputs."""
-    carry, obs, previous, fresh, keep = inputs(seed)
+def plain(xp: Any, params: Any, given: Any) -> tuple[Any, Any]:
+    """The printed equations on inputs that are NumPy arrays."""
+    carry, obs, previous, fresh, keep = given
     frames = [
         [
             (xp.asarray(rows), xp.asarray(word))
@@ -68,7 +69,7 @@ def plain(xp: Any, params: Any, seed: int = 0) -> tuple[Any, Any]:
 def test_logits_and_values_are_those_of_the_printed_equations() -> None:
     carry, obs, previous, fresh, keep = inputs()
     _, out = forward(parameters(), carry, obs, previous, fresh, keep)
-    logits, value = plain(np, equations.in_float64(parameters()))
+    logits, value = plain(np, equations.in_float64(parameters()), jax.device_get(inputs()))
     assert out.logits.shape == (T, B, 6)
     assert out.value.shape == (T, B)
     np.testing.assert_allclose(out.logits, logits, **CLOSE)
@@ -89,12 +90,14 @@ def test_the_gradient_with_a_tape_is_that_of_the_printed_equations() -> None:
         )
         return (out.logits * mix).sum() + (out.value * mix[..., 0]).sum()
 
+    given = jax.device_get(inputs())
+
     def slow(params: Any) -> jax.Array:
-        logits, value = plain(jnp, params)
+        logits, value = plain(jnp, params, given)
         return (logits * mix).sum() + (value * mix[..., 0]).sum()
 
     chex.assert_trees_all_close(
-        jax.grad(fast)(params), jax.grad(slow)(params), rtol=1e-4, atol=2e-5
+        jax.jit(jax.grad(fast))(params), jax.jit(jax.grad(slow))(params), rtol=1e-4, atol=2e-5
     )
 
 
@@ -159,7 +162,8 @@ def test_the_number_of_classes_does_not_change_the_size() -> None:
 
 
 def test_a_new_policy_is_nearly_uniform_and_keys_decide_the_parameters() -> None:
-    params = [network().initialise(jax.random.key(k), WORDS) for k in (0, 0, 1)]
+    initialise = jax.jit(network().initialise)
+    params = [initialise(jax.random.key(k), WORDS) for k in (0, 0, 1)]
     chex.assert_trees_all_equal(params[0], params[1])
     assert not np.array_equal(
         params[0]["encoder"]["linear1"]["kernel"], params[2]["encoder"]["linear1"]["kernel"]
@@ -176,7 +180,7 @@ def test_all_parameters_get_a_gradient() -> None:
         out = forward(params, carry, *rest)[1]
         return (out.logits**2).sum() + (out.value**2).sum()
 
-    for path, leaf in jax.tree.leaves_with_path(jax.grad(loss)(parameters())):
+    for path, leaf in jax.tree.leaves_with_path(jax.jit(jax.grad(loss))(parameters())):
         assert np.asarray(leaf).any(), jax.tree_util.keystr(path)
 
 
@@ -186,7 +190,7 @@ def test_a_bfloat16_network_is_close() -> None:
         TDANetEncoder(7, dtype=jnp.bfloat16), hidden=H, action_width=4, dtype=jnp.bfloat16
     )
     table = half.apply({"params": parameters()}, WORDS, method="prepare")
-    _, out = half.apply({"params": parameters()}, table, carry, *rest)
+    _, out = jax.jit(half.apply)({"params": parameters()}, table, carry, *rest)
     _, full = forward(parameters(), carry, *rest)
     for one, two in ((out.logits, full.logits), (out.value, full.value)):
         assert one.dtype == jnp.float32

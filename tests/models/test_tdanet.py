@@ -40,6 +40,7 @@ def parameters(attention: bool = True, siamese: bool = True) -> Any:
     return samples.randomised(made["params"])
 
 
+@functools.partial(jax.jit, static_argnames=("attention", "siamese"))
 def features(
     params: Any,
     obs: Observation,
@@ -53,6 +54,7 @@ def features(
     return module.apply({"params": params}, table, obs, keep)
 
 
+@functools.partial(jax.jit, static_argnames="attention")
 def weights(params: Any, obs: Observation, words: np.ndarray, attention: bool = True) -> jax.Array:
     module = encoder(attention)
     table = module.apply({"params": params}, jnp.asarray(words), method="prepare")
@@ -106,7 +108,7 @@ def test_the_fast_forms_have_the_gradient_of_the_printed_equations(
         return (features(params, obs, words, keep, attention, siamese) * mix).sum()
 
     chex.assert_trees_all_close(
-        jax.grad(fast)(params), jax.grad(plain)(params), rtol=1e-4, atol=1e-5
+        jax.jit(jax.grad(fast))(params), jax.jit(jax.grad(plain))(params), rtol=1e-4, atol=1e-5
     )
 
 
