@@ -19,7 +19,18 @@ from tdanet_jax import assets
 from tdanet_jax.scenes import ithor, tables
 
 VARIABLE = "TDANET_CACHE"
-_MODULES = ("archive", "scene", "rules", "geometry", "visibility", "tables", "ithor")
+_MODULES = (
+    "archive",
+    "scene",
+    "rules",
+    "geometry",
+    "rays",
+    "solids",
+    "raster",
+    "visibility",
+    "tables",
+    "ithor",
+)
 
 
 def folder() -> Path:

@@ -15,6 +15,18 @@ VIEWS = HEADINGS * HORIZONS
 STEPS = np.array([(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)])
 
 
+def box_frame(box: np.ndarray, corners: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """An object's tightest known box as origin corner [3] and edge vectors [3, 3] (rows).
+
+    Args:
+        box: [2, 3] axis-aligned box. corners: [8, 3] of the oriented box in AI2-THOR's order
+            (bottom face around, then top face around), if it is known.
+    """
+    if corners is None:
+        return box[0], np.diag(box[1] - box[0])
+    return corners[0], corners[[1, 4, 3]] - corners[0]
+
+
 def next_positions(points: np.ndarray) -> np.ndarray:
     """Where MoveAhead leads from each of `points` [P, 3] along each heading: [P, 8] int32.
 
@@ -79,31 +91,35 @@ def action_distances(successor: np.ndarray, goals: np.ndarray) -> np.ndarray:
     return result
 
 
-def box_points(boxes: np.ndarray, steps: int = 4) -> np.ndarray:
-    """A lattice of (steps + 1)^3 points in each of `boxes` [O, 2, 3]: [O, K, 3]."""
-    share = np.arange(steps + 1) / steps
-    lattice = np.stack(np.meshgrid(share, share, share, indexing="ij"), axis=-1).reshape(-1, 3)
-    return boxes[:, None, 0] + lattice * (boxes[:, None, 1] - boxes[:, None, 0])
-
-
-def frustum_rotation(boxes: np.ndarray, visible: np.ndarray, camera: np.ndarray) -> int:
-    """The rotation, of 0, 90, 180, 270, in which most `visible` boxes lie in a 90-degree view.
-
-    Only the view's four planes count, not occlusion, so that the choice does not depend on the
-    rules that are judged against these flags. Among equals, fewest unflagged objects within
-    1.5 m that lie wholly in view; then the least rotation.
+def lattice(origins: np.ndarray, edges: np.ndarray, steps: int = 8) -> np.ndarray:
+    """Centres of the steps^3 cells of each of O boxes: [O, K, 3].
 
     Args:
-        boxes: [O, 2, 3] metres. visible: [O] bool. camera: [3] metres.
+        origins: [O, 3] a corner of each box. edges: [O, 3, 3] its edge vectors.
     """
-    points = box_points(boxes) - camera
-    near = np.hypot(points[..., 0], points[..., 2]).min(axis=1) <= 1.5
+    share = (np.arange(steps) + 0.5) / steps
+    cells = np.stack(np.meshgrid(share, share, share, indexing="ij"), axis=-1).reshape(-1, 3)
+    return origins[:, None] + (cells[None, :, :, None] * edges[:, None]).sum(axis=2)
+
+
+def frustum_rotation(points: np.ndarray, visible: np.ndarray, camera: np.ndarray) -> int:
+    """The likeliest rotation, of 0, 90, 180, 270 degrees, of a level camera with 90-degree view.
+
+    Only the view's four planes count: an object is taken to be visible as probably as a random
+    point of it lies in the view. Occlusion plays no part, so that the choice does not depend on
+    the rules that are judged by these flags. Ties go to the least rotation.
+
+    Args:
+        points: [O, K, 3] points spread over each object within reach, metres.
+        visible: [O] bool, AI2-THOR's flags. camera: [3] metres.
+    """
+    offset = points - camera
     scores = []
     for heading in range(0, HEADINGS, 2):
         x, z = STEPS[heading]
-        depth = points[..., 0] * x + points[..., 2] * z
-        side = points[..., 0] * z - points[..., 2] * x
-        inside = (depth > 0) & (np.abs(side) < depth) & (np.abs(points[..., 1]) < depth)
-        seen = inside.any(axis=1)
-        scores.append(((seen & visible).sum(), -(inside.all(axis=1) & near & ~visible).sum()))
-    return max(range(4), key=lambda quarter: (*scores[quarter], -quarter)) * 90
+        depth = offset[..., 0] * x + offset[..., 2] * z
+        side = offset[..., 0] * z - offset[..., 2] * x
+        inside = (np.abs(side) < depth) & (np.abs(offset[..., 1]) < depth)
+        share = np.clip(inside.mean(axis=1), 0.002, 0.9)
+        scores.append(np.log(np.where(visible, share, 1 - share)).sum())
+    return int(np.argmax(np.round(scores, 6))) * 90

@@ -17,8 +17,8 @@ import numpy as np
 from tdanet_jax import assets
 from tdanet_jax.scenes import archive
 from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.geometry import frustum_rotation
-from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, GRID, Scene, SceneObject
+from tdanet_jax.scenes.geometry import box_frame, frustum_rotation, lattice
+from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, GRID, REACH, Scene, SceneObject
 from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
 
 ASSET = "ithor.npz"
@@ -119,9 +119,7 @@ def _room_arrays(
         "name": name.encode(),
         "room_type": np.int8(room_type),
         "default_position": _whole(agent),
-        "default_rotation": np.int16(
-            frustum_rotation(boxes, visible, agent + (0.0, CAMERA_ABOVE_AGENT, 0.0))
-        ),
+        "default_rotation": np.int16(_default_rotation(kept, agent)),
         "point": _whole(points),
         "object_id": np.array([r["objectId"].encode() for r in kept]),
         "object_class": np.array([r["objectType"].encode() for r in kept]),
@@ -138,6 +136,25 @@ def _room_arrays(
         "object_parents": np.array([len(held) for held in parents], np.int16),
         "parent": np.array([index for held in parents for index in held], np.int16),
     }
+
+
+def _default_rotation(records: list[dict[str, Any]], agent: np.ndarray) -> int:
+    """The rotation of the default frame, inferred from the flags of the objects within reach."""
+    origins, edges, visible = [], [], []
+    for record in records:
+        box = box_of(record)
+        gap = np.maximum(np.maximum(box[0] - agent, agent - box[1]), 0)[[0, 2]]
+        if np.hypot(*gap) <= REACH or record["visible"]:
+            oriented = record["objectOrientedBoundingBox"]
+            corners = np.array(oriented["cornerPoints"]) if oriented else None
+            origin, edge = box_frame(box, corners)
+            origins.append(origin)
+            edges.append(edge)
+            visible.append(record["visible"])
+    points = lattice(np.reshape(origins, (-1, 3)), np.reshape(edges, (-1, 3, 3)))
+    return frustum_rotation(
+        points, np.array(visible, bool), agent + np.array([0, CAMERA_ABOVE_AGENT, 0])
+    )
 
 
 def load_scenes(path: Path | None = None) -> list[Scene]:

@@ -12,19 +12,25 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tdanet_jax.scenes import archive
 from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.geometry import VIEWS, action_distances, next_positions, transitions
+from tdanet_jax.scenes.geometry import (
+    VIEWS,
+    action_distances,
+    next_positions,
+    transitions,
+)
+from tdanet_jax.scenes.raster import paint
 from tdanet_jax.scenes.rules import RULES, Rules
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene
 from tdanet_jax.scenes.visibility import IMAGE, SUBPIXEL, Sight, look_around
 from tdanet_jax.vocabulary import ALL_TARGETS
 
 FIELD_OF_VIEW = 90.0
-RASTER = 7
 
 Progress = Callable[[int, int], None]
 
@@ -49,7 +55,7 @@ class SceneTables:
     object_scene: np.ndarray  # [O] int16
     object_box: np.ndarray  # [O, 6] float64, least then greatest corner in metres
     distance: np.ndarray  # [S, G] int16, fewest actions to see the target; 0 here, -1 no way
-    raster: np.ndarray  # [S, 7, 7] int8, class that fills the image cell (row, column), -1 none
+    raster: np.ndarray  # [S, 7, 7] int8, class of the image cell (row, column), -1 none
     field_of_view: float = FIELD_OF_VIEW  # degrees, horizontal and vertical
     camera_height: float = CAMERA_ABOVE_AGENT  # metres above the agent's y
     image: int = IMAGE  # pixels, width and height of the frame
@@ -77,7 +83,7 @@ class SceneTables:
         return np.repeat(self.position_scene, VIEWS)
 
     def visible_bits(self) -> np.ndarray:
-        """Classes visible in each state as bits: [S, ceil(C / 32)] uint32, class c is bit c % 32."""
+        """Classes visible in each state: [S, ceil(C / 32)] uint32, class c is bit c % 32."""
         visible = np.zeros((self.num_states, -(-len(self.classes) // 32) * 32), bool)
         visible[self.row_state[self.row_visible], self.row_class[self.row_visible]] = True
         octets = np.packbits(visible, axis=1, bitorder="little")
@@ -160,10 +166,12 @@ class SceneTables:
     @classmethod
     def load(cls, path: Path) -> "SceneTables":
         """Read what `save` wrote."""
-        arrays = archive.read(path)
+        arrays: dict[str, Any] = dict(archive.read(path))
         rest = json.loads(arrays.pop("rest").tobytes())
-        rest = {key: tuple(v) if isinstance(v, list) else v for key, v in rest.items()}
-        return cls(**arrays, **rest)
+        fields: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in rest.items()
+        }
+        return cls(**arrays, **fields)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -228,14 +236,14 @@ def _build_room(
     for item in scene.objects:
         if item.object_class not in index:
             raise SceneError(
-                f"{scene.name}: {item.object_id}: class {item.object_class} is not in the vocabulary"
+                f"{scene.name}: {item.object_id}: class {item.object_class} is not known"
             )
     object_class = np.array([index[item.object_class] for item in scene.objects], np.int16)
     sight = look_around(scene, rules)
     states = len(scene.points) * VIEWS
     goals = np.zeros((states, len(targets)), bool)
     for g, target in enumerate(targets):
-        seen = sight.near & (object_class[sight.owner] == index.get(target, -1))
+        seen = sight.visible & (object_class[sight.owner] == index.get(target, -1))
         goals[sight.state[seen], g] = True
     steps = next_positions(scene.points)
     return _Room(
@@ -243,7 +251,7 @@ def _build_room(
         sight=sight,
         object_class=object_class,
         distance=action_distances(transitions(steps), goals),
-        raster=np.full((states, RASTER, RASTER), -1, np.int8),
+        raster=paint(sight.state, sight.box, object_class[sight.owner], states, IMAGE * SUBPIXEL),
     )
 
 
@@ -277,11 +285,12 @@ def _join(
             [room.sight.owner + first_object[i] for i, room in enumerate(rooms)]
         ).astype(np.int32),
         row_box=np.concatenate([room.sight.box for room in rooms]),
-        row_visible=np.concatenate([room.sight.near for room in rooms]),
+        row_visible=np.concatenate([room.sight.visible for room in rooms]),
         object_class=np.concatenate([room.object_class for room in rooms]),
         object_scene=np.repeat(np.arange(len(scenes), dtype=np.int16), objects),
         object_box=np.array(
-            [item.box.reshape(6) for scene in scenes for item in scene.objects], np.float64
+            [item.box.reshape(6) for scene in scenes for item in scene.objects],
+            np.float64,
         ),
         distance=np.concatenate([room.distance for room in rooms]),
         raster=np.concatenate([room.raster for room in rooms]),
