@@ -67,8 +67,7 @@ class ActorCritic(nn.Module):
         """
         features = self.encoder(table, obs, keep)
         action = nn.relu(self.action_embedding(previous))
-        inputs = jnp.concatenate([features, action], axis=-1)
-        carry, hidden = self.lstm(carry, inputs, fresh)
+        carry, hidden = self.lstm(carry, features, action, fresh)
         return carry, Output(self.actor(hidden), self.critic(hidden)[..., 0])
 
     def initial_carry(self, batch: int) -> Carry:

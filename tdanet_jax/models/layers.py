@@ -21,6 +21,39 @@ TAPE = "tape"
 Carry = tuple[jax.Array, jax.Array]
 
 
+def _keeps_transposed(dtype: Any) -> bool:
+    """Whether the tape keeps each input transposed, for the gradient of the kernel.
+
+    XLA's CPU backend gives a bfloat16 product to the processor's matrix units only if both operands
+    lie in memory as a plain `a @ b` reads them. So the backward pass must be handed `x.T` and
+    `kernel.T` as arrays of their own; elsewhere a transposed operand costs nothing.
+    """
+    return jnp.dtype(dtype) == jnp.bfloat16 and jax.default_backend() == "cpu"
+
+
+def _dot(a: jax.Array, b: jax.Array, dtype: Any) -> jax.Array:
+    """a [..., n] @ b [n, m] with operands in `dtype`, accumulated and returned in float32."""
+    rows = a.reshape(-1, a.shape[-1]).astype(dtype)
+    out = jnp.dot(rows, b.astype(dtype), preferred_element_type=jnp.float32)
+    return out.reshape(*a.shape[:-1], b.shape[-1])
+
+
+def _transposed(kernel: jax.Array, dtype: Any) -> jax.Array:
+    """kernel.T in `dtype`; where `_keeps_transposed`, as an array of its own.
+
+    XLA folds a plain transpose into the product that reads it, and a loop's result it cannot fold.
+    """
+    blocks = 4
+    if not _keeps_transposed(dtype) or kernel.shape[1] % blocks:
+        return kernel.T.astype(dtype)
+    width = kernel.shape[1] // blocks
+
+    def block(i: jax.Array) -> jax.Array:
+        return jax.lax.dynamic_slice_in_dim(kernel, i * width, width, axis=1).T.astype(dtype)
+
+    return jax.lax.map(block, jnp.arange(blocks)).reshape(kernel.shape[::-1])
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def product(x: jax.Array, kernel: jax.Array, dtype: Any) -> jax.Array:
     """`x @ kernel` with operands rounded to `dtype`, accumulated and returned in float32.
@@ -31,44 +64,54 @@ def product(x: jax.Array, kernel: jax.Array, dtype: Any) -> jax.Array:
     return _dot(x, kernel, dtype)
 
 
-def _dot(a: jax.Array, b: jax.Array, dtype: Any) -> jax.Array:
-    """a [..., n] @ b [n, m]."""
-    rows = a.reshape(-1, a.shape[-1]).astype(dtype)
-    out = jnp.dot(rows, b.astype(dtype), preferred_element_type=jnp.float32)
-    return out.reshape(*a.shape[:-1], b.shape[-1])
-
-
-def _kernel_gradient(x: jax.Array, cotangent: jax.Array, dtype: Any) -> jax.Array:
-    """The gradient of `product` for its kernel, summed over all leading axes: [n, m]."""
-    return _dot(x.reshape(-1, x.shape[-1]).T, cotangent.reshape(-1, cotangent.shape[-1]), dtype)
-
-
 def _product_fwd(x: jax.Array, kernel: jax.Array, dtype: Any) -> tuple[jax.Array, tuple]:
     return product(x, kernel, dtype), (x, kernel)
 
 
 def _product_bwd(dtype: Any, saved: tuple, cotangent: jax.Array) -> tuple[jax.Array, jax.Array]:
     x, kernel = saved
-    return _dot(cotangent, kernel.T, dtype), _kernel_gradient(x, cotangent, dtype)
+    rows, cotangent_rows = (a.reshape(-1, a.shape[-1]) for a in (x, cotangent))
+    return _dot(cotangent, kernel.T, dtype), _dot(rows.T, cotangent_rows, dtype)
 
 
 product.defvjp(_product_fwd, _product_bwd)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def recall_product(x: jax.Array, kernel: jax.Array, dtype: Any, value: jax.Array) -> jax.Array:
-    """`product(x, kernel, dtype)` whose `value` is known and is not computed again."""
+def recall_product(
+    x: jax.Array, kernel: jax.Array, dtype: Any, value: jax.Array, transposed: jax.Array | None
+) -> jax.Array:
+    """`product(x, kernel, dtype)` over a rollout, taken from the tape.
+
+    Args:
+      x: [T, B, n].
+      kernel: [n, m].
+      dtype: of the operands.
+      value: [T, B, m], the product as it was recorded.
+      transposed: [T, n, B] in `dtype`, x of every step transposed, or None to take it from x.
+    """
     return value
 
 
 def _recall_product_fwd(
-    x: jax.Array, kernel: jax.Array, dtype: Any, value: jax.Array
+    x: jax.Array, kernel: jax.Array, dtype: Any, value: jax.Array, transposed: jax.Array | None
 ) -> tuple[jax.Array, tuple]:
-    return value, (x, kernel)
+    return value, (x, kernel, transposed)
 
 
 def _recall_product_bwd(dtype: Any, saved: tuple, cotangent: jax.Array) -> tuple:
-    return *_product_bwd(dtype, saved, cotangent), None
+    x, kernel, transposed = saved
+    if transposed is None:
+        return *_product_bwd(dtype, (x, kernel), cotangent), None, None
+    back = _transposed(kernel, dtype)
+
+    def body(grad_kernel: jax.Array, step: tuple) -> tuple[jax.Array, jax.Array]:
+        x_t, cotangent_t = step
+        rounded = cotangent_t.astype(dtype)
+        return grad_kernel + _dot(x_t, rounded, dtype), _dot(rounded, back, dtype)
+
+    grad_kernel, grad_x = jax.lax.scan(body, jnp.zeros(kernel.shape), (transposed, cotangent))
+    return grad_x, grad_kernel, None, None
 
 
 recall_product.defvjp(_recall_product_fwd, _recall_product_bwd)
@@ -86,64 +129,79 @@ class Linear(nn.Module):
         """[..., n] -> [..., features]."""
         kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        if self.has_variable(TAPE, "product") and not self.is_mutable_collection(TAPE):
-            return recall_product(x, kernel, self.dtype, self.get_variable(TAPE, "product")) + bias
+        records = self.is_mutable_collection(TAPE)
+        if self.has_variable(TAPE, "product") and not records:
+            value, transposed = self.get_variable(TAPE, "product")
+            return recall_product(x, kernel, self.dtype, value, transposed) + bias
         y = product(x, kernel, self.dtype)
-        if self.is_mutable_collection(TAPE):
-            self.put_variable(TAPE, "product", y)
+        if records:
+            transposed = x.astype(self.dtype).T if _keeps_transposed(self.dtype) else None
+            self.put_variable(TAPE, "product", (y, transposed))
         return y + bias
 
 
 class LSTM(nn.Module):
     """A long short-term memory (Hochreiter and Schmidhuber 1997), as torch.nn.LSTMCell counts it.
 
-    Gates i, f, g, o = sigmoid, sigmoid, tanh, sigmoid of [x, h] W + b_ih + b_hh.
+    Gates i, f, g, o = sigmoid, sigmoid, tanh, sigmoid of [x, aside, h] W + b_ih + b_hh. The few
+    inputs in `aside` have rows of W of their own, which keeps the sizes of the large product round.
     """
 
     features: int
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, carry: Carry, x: jax.Array, fresh: jax.Array) -> tuple[Carry, jax.Array]:
-        """One step, or with a leading time axis on `x` and `fresh`, a whole rollout.
+    def __call__(
+        self, carry: Carry, x: jax.Array, aside: jax.Array, fresh: jax.Array
+    ) -> tuple[Carry, jax.Array]:
+        """One step, or with a leading time axis on `x`, `aside` and `fresh`, a whole rollout.
 
         Args:
           carry: (h, c), each [B, H], from before the (first) step.
           x: [B, n], or [T, B, n].
+          aside: [B, m], or [T, B, m].
           fresh: [B] or [T, B] bool, True where an episode starts: the carry is zero there.
 
         Returns:
           The carry after the last step and the hidden state of every step, [B, H] or [T, B, H].
         """
-        size = x.shape[-1]
-        uniform = nn.initializers.variance_scaling(1.0, "fan_in", "uniform")
-        kernel = self.param("kernel", uniform, (size + self.features, 4 * self.features))
+        bound = self.features**-0.5
+
+        def uniform(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+            return jax.random.uniform(key, shape, minval=-bound, maxval=bound)
+
+        gates = 4 * self.features
+        kernel = self.param("kernel", uniform, (x.shape[-1] + self.features, gates))
         # Two biases, as in the published counts; they act as their sum.
-        bias = self.param("bias_ih", nn.initializers.zeros, (4 * self.features,))
-        bias = bias + self.param("bias_hh", nn.initializers.zeros, (4 * self.features,))
+        bias = self.param("bias_ih", nn.initializers.zeros, (gates,))
+        bias = bias + self.param("bias_hh", nn.initializers.zeros, (gates,))
+        offset = product(aside, self.param("kernel_aside", uniform, (aside.shape[-1], gates)),
+                         jnp.float32) + bias  # fmt: skip
+        records = self.is_mutable_collection(TAPE)
         if x.ndim == 2:
-            after, memory = lstm_step(kernel, bias, carry, x, fresh, self.dtype)
-            if self.is_mutable_collection(TAPE):
+            after, memory = lstm_step(kernel, carry, x, offset, fresh, self.dtype)
+            if records:
                 self.put_variable(TAPE, "memory", memory)
             return after, after[0]
-        if self.has_variable(TAPE, "memory") and not self.is_mutable_collection(TAPE):
+        if self.has_variable(TAPE, "memory") and not records:
             memory = self.get_variable(TAPE, "memory")
-            hidden, cell = recall_lstm(kernel, bias, carry, x, fresh, self.dtype, memory)
+            hidden, cell = recall_lstm(kernel, carry, x, offset, fresh, self.dtype, memory)
             return (hidden[-1], cell[-1]), hidden
 
-        def body(carry: Carry, inputs: tuple[jax.Array, jax.Array]) -> tuple[Carry, jax.Array]:
-            after, _ = lstm_step(kernel, bias, carry, *inputs, self.dtype)
+        def body(carry: Carry, inputs: tuple[jax.Array, ...]) -> tuple[Carry, jax.Array]:
+            after, _ = lstm_step(kernel, carry, *inputs, self.dtype)
             return after, after[0]
 
-        return jax.lax.scan(body, carry, (x, fresh))
+        return jax.lax.scan(body, carry, (x, offset, fresh))
 
 
 #: What one LSTM step keeps for the backward pass: the four gates after their nonlinearity
-#: [B, 4 H] and the cell [B, H].
-Memory = tuple[jax.Array, jax.Array]
+#: [B, 4 H], the cell [B, H], and [x, h] transposed [n + H, B] in the operands' dtype.
+Memory = tuple[jax.Array, jax.Array, jax.Array]
 
 
 def _clear(carry: Carry, fresh: jax.Array) -> Carry:
+    """The carry, zero where an episode starts."""
     hidden, cell = carry
     keep = ~fresh[..., None]
     return jnp.where(keep, hidden, 0.0), jnp.where(keep, cell, 0.0)
@@ -151,93 +209,94 @@ def _clear(carry: Carry, fresh: jax.Array) -> Carry:
 
 def lstm_step(
     kernel: jax.Array,
-    bias: jax.Array,
     carry: Carry,
     x: jax.Array,
+    offset: jax.Array,
     fresh: jax.Array,
     dtype: Any,
 ) -> tuple[Carry, Memory]:
-    """One LSTM step over a batch; the carry of fresh rows is zeroed first."""
+    """One LSTM step over a batch; the carry of fresh rows is zeroed first.
+
+    Args:
+      kernel: [n + H, 4 H].
+      carry: (h, c), each [B, H].
+      x: [B, n].
+      offset: [B, 4 H], what is added to the product: biases and further inputs.
+      fresh: [B] bool.
+      dtype: of the product's operands.
+    """
     hidden, cell = _clear(carry, fresh)
-    z = product(jnp.concatenate([x, hidden], axis=-1), kernel, dtype) + bias
-    i, f, g, o = jnp.split(z, 4, axis=-1)
+    inputs = jnp.concatenate([x.astype(dtype), hidden.astype(dtype)], axis=-1)
+    i, f, g, o = jnp.split(product(inputs, kernel, dtype) + offset, 4, axis=-1)
     i, f, g, o = jax.nn.sigmoid(i), jax.nn.sigmoid(f), jnp.tanh(g), jax.nn.sigmoid(o)
     cell = f * cell + i * g
-    return (o * jnp.tanh(cell), cell), (jnp.concatenate([i, f, g, o], axis=-1), cell)
+    memory = jnp.concatenate([i, f, g, o], axis=-1), cell, inputs.T
+    return (o * jnp.tanh(cell), cell), memory
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(5,))
 def recall_lstm(
     kernel: jax.Array,
-    bias: jax.Array,
     carry: Carry,
     x: jax.Array,
+    offset: jax.Array,
     fresh: jax.Array,
     dtype: Any,
     memory: Memory,
 ) -> Carry:
-    """Hidden state and cell of every step, [T, B, H] each, from what the steps have kept.
-
-    The backward pass walks back through time only for the recurrent part; the products for the
-    input and the kernel are taken once, over all steps.
-    """
-    gates, cell = memory
+    """Hidden state and cell of every step, [T, B, H] each, from what the steps have kept."""
+    gates, cell, _ = memory
     return gates[..., -cell.shape[-1] :] * jnp.tanh(cell), cell
 
 
 def _recall_lstm_fwd(
     kernel: jax.Array,
-    bias: jax.Array,
     carry: Carry,
     x: jax.Array,
+    offset: jax.Array,
     fresh: jax.Array,
     dtype: Any,
     memory: Memory,
 ) -> tuple[Carry, tuple]:
-    out = recall_lstm(kernel, bias, carry, x, fresh, dtype, memory)
-    return out, (kernel, carry, x, fresh, memory, out[0])
+    out = recall_lstm(kernel, carry, x, offset, fresh, dtype, memory)
+    return out, (kernel, carry, fresh, memory)
 
 
 def _recall_lstm_bwd(dtype: Any, saved: tuple, cotangents: Carry) -> tuple:
-    kernel, carry, x, fresh, (gates, cell), hidden = saved
-    size = x.shape[-1]
-    recurrent = kernel[size:].T  # [4 H, H]
+    kernel, carry, fresh, (gates, cell, inputs) = saved
+    before = jnp.concatenate([carry[1][None], cell[:-1]])  # the cell that each step started from
+    back = _transposed(kernel, dtype)  # [4 H, n + H]
+    split = kernel.shape[0] - cell.shape[-1]  # n
 
-    def before(first: jax.Array, later: jax.Array) -> jax.Array:
-        """The state that each step started from, [T, B, H]."""
-        shifted = jnp.concatenate([first[None], later[:-1]])
-        return jnp.where(fresh[..., None], 0.0, shifted)
-
-    previous_hidden, previous_cell = before(carry[0], hidden), before(carry[1], cell)
-
-    def body(grads: Carry, inputs: tuple) -> tuple[Carry, jax.Array]:
-        grad_hidden, grad_cell = grads
-        gates_t, cell_t, previous_t, fresh_t, out_hidden, out_cell = inputs
+    def body(grads: tuple, step: tuple) -> tuple[tuple, tuple]:
+        grad_hidden, grad_cell, grad_kernel = grads
+        gates_t, cell_t, before_t, inputs_t, fresh_t, out_hidden, out_cell = step
         i, f, g, o = jnp.split(gates_t, 4, axis=-1)
         tanh_cell = jnp.tanh(cell_t)
         grad_hidden = grad_hidden + out_hidden
         grad_cell = grad_cell + out_cell + grad_hidden * o * (1 - tanh_cell**2)
+        before_t = jnp.where(fresh_t[:, None], 0.0, before_t)
         grad_z = jnp.concatenate(
             [
                 grad_cell * g * i * (1 - i),
-                grad_cell * previous_t * f * (1 - f),
+                grad_cell * before_t * f * (1 - f),
                 grad_cell * i * (1 - g**2),
                 grad_hidden * tanh_cell * o * (1 - o),
             ],
             axis=-1,
         )
-        earlier = _clear((_dot(grad_z, recurrent, dtype), grad_cell * f), fresh_t)
-        return earlier, grad_z
+        rounded = grad_z.astype(dtype)
+        grad_inputs = _dot(rounded, back, dtype)
+        earlier = _clear((grad_inputs[:, split:], grad_cell * f), fresh_t)
+        grad_kernel = grad_kernel + _dot(inputs_t, rounded, dtype)
+        return (*earlier, grad_kernel), (grad_inputs[:, :split], grad_z)
 
-    zeros = (jnp.zeros_like(carry[0]), jnp.zeros_like(carry[1]))
-    grad_carry, grad_z = jax.lax.scan(
-        body, zeros, (gates, cell, previous_cell, fresh, *cotangents), reverse=True
+    zeros = (jnp.zeros_like(carry[0]), jnp.zeros_like(carry[1]), jnp.zeros(kernel.shape))
+    steps = (gates, cell, before, inputs, fresh, *cotangents)
+    (grad_h, grad_c, grad_kernel), (grad_x, grad_offset) = jax.lax.scan(
+        body, zeros, steps, reverse=True
     )
-    inputs = jnp.concatenate([x, previous_hidden], axis=-1)
-    grad_x = _dot(grad_z, kernel[:size].T, dtype)
-    grad_kernel = _kernel_gradient(inputs, grad_z, dtype)
-    grad_bias = grad_z.sum(axis=(0, 1))
-    return grad_kernel, grad_bias, grad_carry, grad_x, None, None
+    return grad_kernel, (grad_h, grad_c), grad_x, grad_offset, None, None
 
 
 recall_lstm.defvjp(_recall_lstm_fwd, _recall_lstm_bwd)
