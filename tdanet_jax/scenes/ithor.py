@@ -6,6 +6,7 @@ metadata of one default frame per room, `alfworld` the reachable points of the 0
 default frame is not written down in the metadata: it follows from the distances to all objects.
 """
 
+import dataclasses
 import io
 import json
 import zipfile
@@ -18,6 +19,7 @@ from tdanet_jax import assets
 from tdanet_jax.scenes import archive
 from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.geometry import box_frame, frustum_rotation, lattice
+from tdanet_jax.scenes.metadata import parse_scene
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, GRID, REACH, Scene, SceneObject
 from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
 
@@ -25,15 +27,6 @@ ASSET = "ithor.npz"
 UNIT = 1e-4  # metres; the file holds whole numbers of tenths of a millimetre
 METADATA = "procthor/databases/ai2thor-object-metadata.json"
 LAYOUT = "alfworld/gen/layouts/{name}-layout.npy"
-IGNORED = "Floor"  # neither hides nor is looked for; its box spans the room
-
-
-def box_of(record: dict[str, Any]) -> np.ndarray:
-    """Least and greatest corner [2, 3] of a metadata record's axis-aligned box, metres."""
-    box = record["axisAlignedBoundingBox"]
-    center = np.array([box["center"][axis] for axis in "xyz"])
-    half = np.array([box["size"][axis] for axis in "xyz"]) / 2
-    return np.stack([center - half, center + half])
 
 
 def locate_agent(records: list[dict[str, Any]]) -> np.ndarray:
@@ -71,7 +64,8 @@ def build_asset(procthor_wheel: Path, alfworld_wheel: Path, out_dir: Path) -> Pa
                 layout = np.load(
                     io.BytesIO(wheel.read(LAYOUT.format(name=name))), allow_pickle=False
                 )
-                rooms.append(_room_arrays(name, room_type, metadata[f"{room}s"][offset], layout))
+                scene = _room(name, room_type, metadata[f"{room}s"][offset], layout)
+                rooms.append(_room_arrays(scene))
     scene_keys = ("name", "room_type", "default_position", "default_rotation")
     arrays = {f"scene_{key}": np.array([room[key] for room in rooms]) for key in scene_keys}
     for key in rooms[0]:
@@ -93,68 +87,61 @@ def _whole(lengths: Any) -> np.ndarray:
     return np.rint(np.asarray(lengths, np.float64) / UNIT).astype(np.int32)
 
 
-def _room_arrays(
-    name: str, room_type: int, records: list[dict[str, Any]], layout: np.ndarray
-) -> dict[str, Any]:
-    """One room as arrays of whole numbers; objects sorted by (class, id)."""
+def _room(name: str, room_type: int, records: list[dict[str, Any]], layout: np.ndarray) -> Scene:
+    """One room from its metadata and its reachable (x, z)."""
     agent = locate_agent(records)
     grid = np.rint(layout / GRID) * GRID
     if len(grid) == 0 or np.abs(grid - layout).max() > 1e-3:
         raise SceneError(f"{name}: reachable points are not on a {GRID} m grid")
-    grid = np.unique(grid, axis=0)  # sorted by (x, z)
     points = np.stack([grid[:, 0], np.full(len(grid), agent[1]), grid[:, 1]], axis=1)
-    kept = sorted(
-        (r for r in records if r["objectType"] != IGNORED),
-        key=lambda r: (r["objectType"], r["objectId"]),
-    )
-    boxes = np.array([box_of(r) for r in kept])
-    oriented = [i for i, r in enumerate(kept) if r["objectOrientedBoundingBox"]]
-    corners = [kept[i]["objectOrientedBoundingBox"]["cornerPoints"] for i in oriented]
-    corner_index = np.full(len(kept), -1, np.int16)
-    corner_index[oriented] = np.arange(len(oriented))
-    visible = np.array([r["visible"] for r in kept])
-    row = {r["objectId"]: i for i, r in enumerate(kept)}
-    parents = [sorted(row[p] for p in r["parentReceptacles"] or () if p in row) for r in kept]
+    scene = parse_scene(name, room_type, records, points, agent)
+    return dataclasses.replace(scene, default_rotation=_default_rotation(scene))
+
+
+def _room_arrays(scene: Scene) -> dict[str, Any]:
+    """One room as arrays of whole numbers."""
+    items = scene.objects
+    corners = [item.corners for item in items if item.corners is not None]
+    row = {item.object_id: i for i, item in enumerate(items)}
+    parents = [sorted(row[p] for p in item.parents if p in row) for item in items]
     return {
-        "name": name.encode(),
-        "room_type": np.int8(room_type),
-        "default_position": _whole(agent),
-        "default_rotation": np.int16(_default_rotation(kept, agent)),
-        "point": _whole(points),
-        "object_id": np.array([r["objectId"].encode() for r in kept]),
-        "object_class": np.array([r["objectType"].encode() for r in kept]),
-        "object_box": _whole(boxes),
-        "object_corners": corner_index,
+        "name": scene.name.encode(),
+        "room_type": np.int8(scene.room_type),
+        "default_position": _whole(scene.default_position),
+        "default_rotation": np.int16(scene.default_rotation or 0),
+        "point": _whole(scene.points),
+        "object_id": np.array([item.object_id.encode() for item in items]),
+        "object_class": np.array([item.object_class.encode() for item in items]),
+        "object_box": _whole([item.box for item in items]),
+        "object_corners": np.array([0 if o.corners is not None else -1 for o in items], np.int16),
         "corners": _whole(corners).reshape(-1, 8, 3),
-        "object_rotation": np.rint(
-            [[r["rotation"][axis] * 1000 for axis in "xyz"] for r in kept]
-        ).astype(np.int32),  # thousandths of a degree
-        "object_openable": np.array([r["openable"] for r in kept]),
-        "object_is_open": np.array([r["isOpen"] for r in kept]),
-        "object_pickupable": np.array([r["pickupable"] for r in kept]),
-        "object_visible": visible,
+        "object_rotation": np.rint([[1000 * a for a in o.rotation] for o in items]).astype(
+            np.int32
+        ),  # thousandths of a degree
+        "object_openable": np.array([item.openable for item in items]),
+        "object_is_open": np.array([item.is_open for item in items]),
+        "object_pickupable": np.array([item.pickupable for item in items]),
+        "object_visible": np.array([bool(item.visible) for item in items]),
         "object_parents": np.array([len(held) for held in parents], np.int16),
         "parent": np.array([index for held in parents for index in held], np.int16),
     }
 
 
-def _default_rotation(records: list[dict[str, Any]], agent: np.ndarray) -> int:
+def _default_rotation(scene: Scene) -> int:
     """The rotation of the default frame, inferred from the flags of the objects within reach."""
+    agent = scene.default_position
+    assert agent is not None
     origins, edges, visible = [], [], []
-    for record in records:
-        box = box_of(record)
-        gap = np.maximum(np.maximum(box[0] - agent, agent - box[1]), 0)[[0, 2]]
-        if np.hypot(*gap) <= REACH or record["visible"]:
-            oriented = record["objectOrientedBoundingBox"]
-            corners = np.array(oriented["cornerPoints"]) if oriented else None
-            origin, edge = box_frame(box, corners)
+    for item in scene.objects:
+        gap = np.maximum(np.maximum(item.box[0] - agent, agent - item.box[1]), 0)[[0, 2]]
+        if np.hypot(*gap) <= REACH or item.visible:
+            origin, edge = box_frame(item.box, item.corners)
             origins.append(origin)
             edges.append(edge)
-            visible.append(record["visible"])
+            visible.append(item.visible)
     points = lattice(np.reshape(origins, (-1, 3)), np.reshape(edges, (-1, 3, 3)))
-    return frustum_rotation(
-        points, np.array(visible, bool), agent + np.array([0, CAMERA_ABOVE_AGENT, 0])
-    )
+    camera = agent + np.array([0, CAMERA_ABOVE_AGENT, 0])
+    return frustum_rotation(points, np.array(visible, bool), camera)
 
 
 def load_scenes(path: Path | None = None) -> list[Scene]:

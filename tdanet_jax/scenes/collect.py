@@ -1,0 +1,57 @@
+"""Writing a scene file from a running AI2-THOR, for those who have Unity (`pip install ai2thor`).
+
+The controller is an argument: this module needs neither Unity nor the `ai2thor` package.
+"""
+
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from tdanet_jax.scenes.errors import SceneError
+from tdanet_jax.scenes.scene import GRID
+
+FIELDS = (
+    "objectId", "objectType", "axisAlignedBoundingBox", "objectOrientedBoundingBox", "rotation",
+    "openable", "isOpen", "pickupable", "parentReceptacles", "visible",
+)  # fmt: skip
+
+
+def collect(controller: Any, rooms: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
+    """Scene documents of AI2-THOR scenes.
+
+    Args:
+        controller: an `ai2thor.controller.Controller`, or anything with its `reset` and `step`.
+        rooms: (AI2-THOR scene name, room type) pairs.
+
+    Raises:
+        SceneError: an action failed.
+    """
+    documents = []
+    for name, room_type in rooms:
+        start = controller.reset(scene=name, gridSize=GRID).metadata
+        event = controller.step(action="GetReachablePositions")
+        if not event.metadata["lastActionSuccess"]:
+            raise SceneError(f"{name}: GetReachablePositions: {event.metadata['errorMessage']}")
+        documents.append(
+            {
+                "name": name,
+                "room_type": room_type,
+                "agent": {
+                    key: start["agent"][key] for key in ("position", "rotation", "cameraHorizon")
+                },
+                "reachable_positions": event.metadata["actionReturn"],
+                "objects": [
+                    {field: record.get(field) for field in FIELDS} for record in start["objects"]
+                ],
+            }
+        )
+    return documents
+
+
+def write_scenes(documents: list[dict[str, Any]], path: Path) -> None:
+    """Write a scene file; an existing file is replaced only once the new one is whole."""
+    fresh = path.with_name(f".{path.name}.{os.getpid()}")
+    fresh.write_text(json.dumps(documents), encoding="utf-8")
+    os.replace(fresh, path)

@@ -1,0 +1,215 @@
+"""Rooms from AI2-THOR's object metadata: the bundled ones and a user's own.
+
+A scene file is JSON: one scene or a list of scenes, each an object with
+
+    name                 any name that is not taken twice
+    room_type            kitchen, living_room, bedroom or bathroom
+    objects              controller.last_event.metadata["objects"]
+    reachable_positions  the actionReturn of GetReachablePositions, gridSize 0.25
+    agent                optional, metadata["agent"] at the time: lets the flags be verified
+
+Of each object are read objectId, objectType, axisAlignedBoundingBox and, where they are,
+objectOrientedBoundingBox, rotation, openable, isOpen, pickupable, parentReceptacles, visible.
+"""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tdanet_jax import words
+from tdanet_jax.scenes.errors import SceneError
+from tdanet_jax.scenes.scene import GRID, Scene, SceneObject
+from tdanet_jax.vocabulary import ROOM_TYPES
+
+IGNORED = "Floor"  # neither hides nor is looked for; its box spans the room
+ALIGNED = 0.02  # metres by which a point may miss the grid
+FARTHEST = 1000.0  # metres from the origin; a coordinate beyond is a mistake
+
+
+def parse_scene(
+    name: str,
+    room_type: int,
+    records: Sequence[Mapping[str, Any]],
+    points: np.ndarray,
+    default_position: np.ndarray | None = None,
+    default_rotation: int | None = None,
+) -> Scene:
+    """A room from AI2-THOR's object records and reachable points [P, 3]; points are sorted.
+
+    Raises:
+        SceneError: a record or the points break a rule; names scene, object and rule.
+    """
+    objects = [parse_object(name, r) for r in records if _text(name, r, "objectType") != IGNORED]
+    objects.sort(key=lambda item: (item.object_class, item.object_id))
+    if not objects:
+        raise SceneError(f"{name}: no objects")
+    identity, times = Counter(item.object_id for item in objects).most_common(1)[0]
+    if times > 1:
+        raise SceneError(f"{name}: {identity}: id occurs {times} times")
+    points = check_points(name, points)
+    return Scene(name, room_type, points, tuple(objects), default_position, default_rotation)
+
+
+def check_points(name: str, points: np.ndarray) -> np.ndarray:
+    """Reachable points [P, 3] sorted by (x, z), without repeats.
+
+    Raises:
+        SceneError: there are none, or they do not lie on a grid of 0.25 m.
+    """
+    if len(points) == 0:
+        raise SceneError(f"{name}: no reachable position")
+    if not np.isfinite(points).all() or np.abs(points).max() > FARTHEST:
+        raise SceneError(f"{name}: a reachable position is not finite or over {FARTHEST:.0f} m")
+    steps = (points - points[0])[:, [0, 2]] / GRID
+    off = np.abs(steps - np.rint(steps)).max(axis=1) * GRID
+    if off.max() > ALIGNED:
+        x, _, z = points[off.argmax()]
+        raise SceneError(f"{name}: reachable position x {x:.3f}, z {z:.3f}: off the {GRID} m grid")
+    _, first = np.unique(np.rint(steps), axis=0, return_index=True)
+    return points[first]
+
+
+def parse_object(scene: str, record: Mapping[str, Any]) -> SceneObject:
+    """One object from its metadata record.
+
+    Raises:
+        SceneError: a field is missing, of the wrong kind, or not finite.
+    """
+    name = _text(scene, record, "objectId")
+    box = record.get("axisAlignedBoundingBox")
+    if not isinstance(box, Mapping):
+        raise SceneError(f"{scene}: {name}: no axisAlignedBoundingBox")
+    center = _vector(scene, name, box, "center")
+    half = _vector(scene, name, box, "size") / 2
+    if (half < 0).any():
+        raise SceneError(f"{scene}: {name}: box has a negative size")
+    oriented = record.get("objectOrientedBoundingBox")
+    rotation = np.zeros(3)
+    if record.get("rotation") is not None:
+        rotation = _vector(scene, name, record, "rotation")
+    parents = record.get("parentReceptacles") or ()
+    return SceneObject(
+        object_id=name,
+        object_class=_text(scene, record, "objectType"),
+        box=np.stack([center - half, center + half]),
+        corners=_corners(scene, name, oriented) if oriented else None,
+        rotation=(float(rotation[0]), float(rotation[1]), float(rotation[2])),
+        openable=bool(record.get("openable")),
+        is_open=bool(record.get("isOpen")),
+        pickupable=bool(record.get("pickupable")),
+        parents=tuple(sorted(p for p in parents if p.split("|")[0] != IGNORED)),
+        visible=None if record.get("visible") is None else bool(record["visible"]),
+    )
+
+
+def _text(scene: str, record: Mapping[str, Any], key: str) -> str:
+    value = record.get(key) if isinstance(record, Mapping) else None
+    if not isinstance(value, str) or not value:
+        raise SceneError(f"{scene}: an object without {key}")
+    return value
+
+
+def _vector(scene: str, name: str, record: Mapping[str, Any], key: str) -> np.ndarray:
+    value = record.get(key)
+    if not isinstance(value, Mapping) or not all(_is_number(value.get(a)) for a in "xyz"):
+        raise SceneError(f"{scene}: {name}: {key} is not x, y, z, finite and within {FARTHEST:.0f}")
+    return np.array([float(value[axis]) for axis in "xyz"])
+
+
+def _is_number(value: Any) -> bool:
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and math.isfinite(value)
+        and abs(value) <= FARTHEST
+    )
+
+
+def _corners(scene: str, name: str, oriented: Any) -> np.ndarray:
+    """Corners [8, 3] of an oriented box; three edges from the first must be its sides."""
+    points = oriented.get("cornerPoints") if isinstance(oriented, Mapping) else None
+    if (
+        not isinstance(points, Sequence)
+        or len(points) != 8
+        or not all(isinstance(p, Sequence) and len(p) == 3 for p in points)
+        or not all(_is_number(value) for point in points for value in point)
+    ):
+        raise SceneError(f"{scene}: {name}: objectOrientedBoundingBox needs 8 finite cornerPoints")
+    return np.array(points, np.float64)
+
+
+def read_scenes(path: Path) -> list[Scene]:
+    """The rooms of a scene file.
+
+    Raises:
+        SceneError: it is not such a file, or a scene breaks a rule; one line naming where.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise SceneError(f"{path}: not JSON ({error})") from None
+    documents = content if isinstance(content, list) else [content]
+    if not documents:
+        raise SceneError(f"{path}: no scenes")
+    scenes = [_read_scene(path, document) for document in documents]
+    name, times = Counter(scene.name for scene in scenes).most_common(1)[0]
+    if times > 1:
+        raise SceneError(f"{path}: {name}: name occurs {times} times")
+    return scenes
+
+
+def _read_scene(path: Path, document: Any) -> Scene:
+    if not isinstance(document, Mapping) or not isinstance(document.get("name"), str):
+        raise SceneError(f"{path}: a scene without a name")
+    name = document["name"]
+    if document.get("room_type") not in ROOM_TYPES:
+        raise SceneError(f"{name}: room_type {document.get('room_type')!r}, not {ROOM_TYPES}")
+    for key in ("objects", "reachable_positions"):
+        if not isinstance(document.get(key), list):
+            raise SceneError(f"{name}: {key} is not a list")
+    points = [
+        _vector(name, f"reachable_positions[{i}]", {"position": point}, "position")
+        for i, point in enumerate(document["reachable_positions"])
+    ]
+    position, rotation = None, None
+    if document.get("agent") is not None:
+        position, rotation = _agent(name, document["agent"])
+    return parse_scene(
+        name,
+        ROOM_TYPES.index(document["room_type"]),
+        document["objects"],
+        np.reshape(points, (-1, 3)),
+        position,
+        rotation,
+    )
+
+
+def _agent(scene: str, agent: Any) -> tuple[np.ndarray | None, int | None]:
+    """Position and rotation of a level agent that looks along an axis or diagonal, else None."""
+    if not isinstance(agent, Mapping):
+        raise SceneError(f"{scene}: agent is not metadata's agent record")
+    position = _vector(scene, "agent", agent, "position")
+    turn = _vector(scene, "agent", agent, "rotation")[1]
+    if abs(agent.get("cameraHorizon") or 0) > 1 or abs((turn + 22.5) % 45 - 22.5) > 1:
+        return None, None
+    return position, round(turn / 45) * 45 % 360
+
+
+def check_classes(scenes: Sequence[Scene]) -> None:
+    """Every class must have a word vector, or no model could tell it from others.
+
+    Raises:
+        SceneError: a class has none; names scene, object and the word.
+    """
+    vectors = words.load_bundled()
+    for scene in scenes:
+        for item in scene.objects:
+            try:
+                vectors.embed(item.object_class)
+            except KeyError as error:
+                raise SceneError(f"{scene.name}: {item.object_id}: {error.args[0]}") from None
