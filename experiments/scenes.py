@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
+from rich import box
 from rich.table import Table
 
 from experiments.console import console, fail, one_line_errors, reporter
@@ -26,7 +27,6 @@ from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TRAIN_SCENES_PER_TYPE
 
 if TYPE_CHECKING:
     from tdanet_jax.scenes import SceneTables
-    from tdanet_jax.scenes.agreement import Count
     from tdanet_jax.scenes.scene import Scene
 
 
@@ -101,11 +101,17 @@ def flag_table(train: list[Scene], test: list[Scene], worst: int) -> Table:
         return case.extras + case.misses
 
     names = sorted(columns[0], key=lambda name: (-errors(name), name))[:worst]
-    table = Table(title="AI2-THOR's own `visible` flags in the default frame of each room")
+    table = Table(
+        title=f"AI2-THOR's own `visible` flags in the default frames of the {len(train)} training "
+        f"and {len(test)} test rooms",
+        caption="both: visible to AI2-THOR and here; us: here alone; it: to AI2-THOR alone",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
     table.add_column("visible to", no_wrap=True)
-    for title in (f"{len(train)} train", f"{len(test)} test"):
-        for name in (f"{title}\nboth", "\nus", "\nit", "\nprec.", "\nrecall", "\nF1"):
-            table.add_column(name, justify="right")
+    for title in ("train", "test"):
+        for name in (f"{title}\nboth", "\nus", "\nit", "\nprec", "\nrec", "\nF1"):
+            table.add_column(name, justify="right", no_wrap=True)
     for title, members in [*groups, *((name, (name,)) for name in names)]:
         cells = [title]
         for column in columns:
