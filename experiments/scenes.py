@@ -12,14 +12,12 @@ import importlib
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
-from rich import box
-from rich.table import Table
 
 from experiments.console import console, fail, one_line_errors, reporter
 from tdanet_jax.scenes.scene import GRID
@@ -66,7 +64,8 @@ class Verify:
         rooms = ithor.load_scenes()
         train = [room for i, room in enumerate(rooms) if _trains(i)]
         test = [room for i, room in enumerate(rooms) if not _trains(i)]
-        console.print(flag_table(train, test, self.worst))
+        for line in flag_lines(train, test, self.worst):
+            console.print(line)
         console.print(box_line(rooms, self.rooms, self.views))
         print_survey(_bundled())
         console.print(f"{time.monotonic() - start:.0f} s")
@@ -83,44 +82,37 @@ def _bundled() -> SceneTables:
         return load_tables(lambda done, total: report(done / total, "rebuilt"))
 
 
-def flag_table(train: list[Scene], test: list[Scene], worst: int) -> Table:
-    """Agreement with AI2-THOR's `visible` flags in the default frames."""
+def flag_lines(train: list[Scene], test: list[Scene], worst: int) -> Iterator[str]:
+    """Agreement with AI2-THOR's `visible` flags in the default frames, as lines of a table."""
     from tdanet_jax.reward import PARENT_CANDIDATES
     from tdanet_jax.scenes.agreement import Count, by_class
     from tdanet_jax.scenes.rules import RULES
 
     columns = [by_class(rooms, RULES) for rooms in (train, test)]
-    groups: list[tuple[str, Iterable[str]]] = [
-        ("all classes", columns[0].keys() | columns[1].keys()),
-        ("22 targets", ALL_TARGETS),
-        ("possible parents", PARENT_CANDIDATES),
-    ]
 
     def errors(name: str) -> int:
         case = columns[0].get(name, Count())
         return case.extras + case.misses
 
     names = sorted(columns[0], key=lambda name: (-errors(name), name))[:worst]
-    table = Table(
-        title=f"AI2-THOR's own `visible` flags in the default frames of the {len(train)} training "
-        f"and {len(test)} test rooms",
-        caption="both: visible to AI2-THOR and here; us: here alone; it: to AI2-THOR alone",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-    )
-    table.add_column("visible to", no_wrap=True)
-    for title in ("train", "test"):
-        for name in (f"{title}\nboth", "\nus", "\nit", "\nprec", "\nrec", "\nF1"):
-            table.add_column(name, justify="right", no_wrap=True)
-    for title, members in [*groups, *((name, (name,)) for name in names)]:
-        cells = [title]
+    groups: list[tuple[str, Iterable[str]]] = [
+        ("all classes", columns[0].keys() | columns[1].keys()),
+        ("22 targets", ALL_TARGETS),
+        ("possible parents", PARENT_CANDIDATES),
+        *((f"  {name}", (name,)) for name in names),
+    ]
+    heads = [f"{len(rooms):>10} {kind} rooms" for rooms, kind in ((train, "train"), (test, "test"))]
+    yield "AI2-THOR's own `visible` flags in the default frame of each room. both: visible to"
+    yield "AI2-THOR and here, us: here alone, it: to AI2-THOR alone"
+    yield f"{'':18}" + "".join(f"{head:29}" for head in heads).rstrip()
+    yield f"{'':18}" + " both  us  it prec  rec    F1 " * 2
+    for title, members in groups:
+        line = f"{title:18}"
         for column in columns:
-            total = sum((column[name] for name in members if name in column), Count())
-            cells += [str(n) for n in (total.hits, total.extras, total.misses)]
-            cells += [f"{share:.2f}" for share in (total.precision, total.recall)]
-            cells.append(f"{total.f1:.3f}")
-        table.add_row(*cells, end_section=title == groups[-1][0])
-    return table
+            c = sum((column[name] for name in members if name in column), Count())
+            line += f" {c.hits:4} {c.extras:3} {c.misses:3} "
+            line += f"{c.precision:.2f} {c.recall:.2f} {c.f1:.3f} "
+        yield line
 
 
 def box_line(rooms: list[Scene], count: int, views: int) -> str:
