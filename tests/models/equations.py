@@ -76,25 +76,28 @@ def encode(
     return relu(xp, linear(params["linear4"], hidden))
 
 
-def lstm(xp: Any, params: Params, hidden: Array, cell: Array, x: Array) -> tuple[Array, Array]:
-    """One step, with the gates in the order i, f, g, o and two biases."""
-    kernel = params["kernel"]
-    z = x @ kernel[: x.shape[-1]] + params["bias_ih"]
-    z = z + hidden @ kernel[x.shape[-1] :] + params["bias_hh"]
+def lstm(
+    xp: Any, params: Params, hidden: Array, cell: Array, x: Array, aside: Array
+) -> tuple[Array, Array]:
+    """One step on the inputs [x, aside], with the gates in the order i, f, g, o and two biases."""
+    first, last = params["kernel"][: x.shape[-1]], params["kernel"][x.shape[-1] :]
+    kernel = xp.concatenate([first, params["kernel_aside"], last])
+    z = xp.concatenate([x, aside, hidden], axis=-1) @ kernel
+    z = z + params["bias_ih"] + params["bias_hh"]
     i, f, g, o = xp.split(z, 4, axis=-1)
     cell = sigmoid(xp, f) * cell + sigmoid(xp, i) * xp.tanh(g)
     return sigmoid(xp, o) * xp.tanh(cell), cell
 
 
 def lstm_rollout(
-    xp: Any, params: Params, hidden: Array, cell: Array, x: Array, fresh: Array
+    xp: Any, params: Params, hidden: Array, cell: Array, x: Array, aside: Array, fresh: Array
 ) -> tuple[Array, tuple[Array, Array]]:
     """Hidden states [T, B, H] of T steps and the last carry; the carry is zero where fresh."""
     out = []
-    for x_t, fresh_t in zip(x, fresh, strict=True):
+    for x_t, aside_t, fresh_t in zip(x, aside, fresh, strict=True):
         hidden = xp.where(fresh_t[:, None], 0.0, hidden)
         cell = xp.where(fresh_t[:, None], 0.0, cell)
-        hidden, cell = lstm(xp, params, hidden, cell, x_t)
+        hidden, cell = lstm(xp, params, hidden, cell, x_t, aside_t)
         out.append(hidden)
     return xp.stack(out), (hidden, cell)
 
@@ -127,7 +130,7 @@ def actor_critic(
     **encoder: Any,
 ) -> tuple[Array, Array]:
     """Logits [T, B, 6] and values [T, B] of a rollout of frames[t][b]."""
-    inputs = []
+    inputs, actions = [], []
     for t, row in enumerate(frames):
         features = [
             encode(
@@ -136,9 +139,9 @@ def actor_critic(
             )
             for b, frame in enumerate(row)
         ]  # fmt: skip
-        action = relu(xp, linear(params["action_embedding"], previous[t]))
-        inputs.append(xp.concatenate([xp.stack(features), action], axis=-1))
-    hidden, _ = lstm_rollout(xp, params["lstm"], *carry, xp.stack(inputs), fresh)
+        inputs.append(xp.stack(features))
+        actions.append(relu(xp, linear(params["action_embedding"], previous[t])))
+    hidden, _ = lstm_rollout(xp, params["lstm"], *carry, xp.stack(inputs), xp.stack(actions), fresh)
     return linear(params["actor"], hidden), linear(params["critic"], hidden)[..., 0]
 
 
