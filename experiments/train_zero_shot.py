@@ -83,7 +83,7 @@ def default_folder(config: TrainConfig) -> Path:
 def train(config: TrainConfig, folder: Path, tensorboard: bool) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
     from tdanet_jax import episodes, figures, scenes, words
-    from tdanet_jax.task import make_task
+    from tdanet_jax.task import make_task, resolve_precision
     from tdanet_jax.training import Run, read_metrics
 
     stop = StopRequest()
@@ -91,13 +91,15 @@ def train(config: TrainConfig, folder: Path, tensorboard: bool) -> None:
         tables = scenes.load_tables(lambda done, total: report_rooms(done / total, "rebuilt"))
     task = make_task(config, tables, words.load_bundled())
     lists = episodes.load(tables, task.split)
+    # What `auto` means here is part of the run: it goes on with the same products elsewhere.
+    config = dataclasses.replace(config, network=resolve_precision(config.network))
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG_FILE).write_text(json.dumps(configs.to_json(config), indent=2) + "\n")
     run = Run(folder, config, task)
     console.print(f"{config.model}, split {task.split.name}, seed {config.seed} -> {folder}")
     console.print("compiling ...")
     saved = run.seconds
-    with reporter("training", every=20) as report, metrics_sink(folder, tensorboard) as sink:
+    with reporter("training", every=10) as report, metrics_sink(folder, tensorboard) as sink:
         for row in run.chunks():
             report(
                 run.progress,

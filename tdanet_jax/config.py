@@ -62,8 +62,9 @@ class NetworkConfig:
     """One detection per class (extent over its instances) or per object, as in the paper."""
     word_norm: float = 3.0
     """Length that every word vector is scaled to."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Operands of the large products; parameters and sums are always float32."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Operands of the large products; parameters and sums are always float32. auto: bfloat16 where
+    the hardware multiplies it faster, on accelerators and on CPUs with AMX."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -58,8 +59,19 @@ def make_task(config: TrainConfig, tables: SceneTables, vectors: WordVectors) ->
     )
 
 
+def resolve_precision(config: NetworkConfig) -> NetworkConfig:
+    """The configuration with `auto` replaced by what suits this machine."""
+    if config.precision != "auto":
+        return config
+    cpuinfo = Path("/proc/cpuinfo")
+    on_cpu = jax.default_backend() == "cpu"
+    has_amx = on_cpu and cpuinfo.exists() and "amx_bf16" in cpuinfo.read_text()
+    fast = has_amx or not on_cpu
+    return dataclasses.replace(config, precision="bfloat16" if fast else "float32")
+
+
 def make_model(config: NetworkConfig) -> ActorCritic:
     """The network of a configuration."""
-    dtype = {"float32": jnp.float32, "bfloat16": jnp.bfloat16}[config.precision]
+    dtype = jnp.dtype(resolve_precision(config).precision)
     encoder = TDANetEncoder(width=config.width, dropout=config.dropout, dtype=dtype)
     return ActorCritic(encoder, hidden=config.hidden, dtype=dtype)

@@ -38,6 +38,19 @@ def _dot(a: jax.Array, b: jax.Array, dtype: Any) -> jax.Array:
     return out.reshape(*a.shape[:-1], b.shape[-1])
 
 
+def _pack(x: jax.Array) -> jax.Array:
+    """bfloat16 as its bits, anything else as it is, for arrays that a loop stacks.
+
+    XLA's CPU backend updates a bfloat16 array by converting all of it to float32 and back.
+    """
+    return jax.lax.bitcast_convert_type(x, jnp.uint16) if x.dtype == jnp.bfloat16 else x
+
+
+def _unpack(x: jax.Array) -> jax.Array:
+    """The inverse of `_pack`."""
+    return jax.lax.bitcast_convert_type(x, jnp.bfloat16) if x.dtype == jnp.uint16 else x
+
+
 def _transposed(kernel: jax.Array, dtype: Any) -> jax.Array:
     """kernel.T in `dtype`; where `_keeps_transposed`, as an array of its own.
 
@@ -49,9 +62,10 @@ def _transposed(kernel: jax.Array, dtype: Any) -> jax.Array:
     width = kernel.shape[1] // blocks
 
     def block(i: jax.Array) -> jax.Array:
-        return jax.lax.dynamic_slice_in_dim(kernel, i * width, width, axis=1).T.astype(dtype)
+        columns = jax.lax.dynamic_slice_in_dim(kernel, i * width, width, axis=1)
+        return _pack(columns.T.astype(dtype))
 
-    return jax.lax.map(block, jnp.arange(blocks)).reshape(kernel.shape[::-1])
+    return _unpack(jax.lax.map(block, jnp.arange(blocks))).reshape(kernel.shape[::-1])
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
@@ -88,7 +102,7 @@ def recall_product(
       kernel: [n, m].
       dtype: of the operands.
       value: [T, B, m], the product as it was recorded.
-      transposed: [T, n, B] in `dtype`, x of every step transposed, or None to take it from x.
+      transposed: [T, n, B] packed, x of every step transposed; or None to take it from x.
     """
     return value
 
@@ -108,7 +122,7 @@ def _recall_product_bwd(dtype: Any, saved: tuple, cotangent: jax.Array) -> tuple
     def body(grad_kernel: jax.Array, step: tuple) -> tuple[jax.Array, jax.Array]:
         x_t, cotangent_t = step
         rounded = cotangent_t.astype(dtype)
-        return grad_kernel + _dot(x_t, rounded, dtype), _dot(rounded, back, dtype)
+        return grad_kernel + _dot(_unpack(x_t), rounded, dtype), _dot(rounded, back, dtype)
 
     grad_kernel, grad_x = jax.lax.scan(body, jnp.zeros(kernel.shape), (transposed, cotangent))
     return grad_x, grad_kernel, None, None
@@ -135,7 +149,8 @@ class Linear(nn.Module):
             return recall_product(x, kernel, self.dtype, value, transposed) + bias
         y = product(x, kernel, self.dtype)
         if records:
-            transposed = x.astype(self.dtype).T if _keeps_transposed(self.dtype) else None
+            kept = _keeps_transposed(self.dtype)
+            transposed = _pack(x.astype(self.dtype).T) if kept else None
             self.put_variable(TAPE, "product", (y, transposed))
         return y + bias
 
@@ -172,31 +187,34 @@ class LSTM(nn.Module):
 
         gates = 4 * self.features
         kernel = self.param("kernel", uniform, (x.shape[-1] + self.features, gates))
+        kernel_aside = self.param("kernel_aside", uniform, (aside.shape[-1], gates))
         # Two biases, as in the published counts; they act as their sum.
         bias = self.param("bias_ih", nn.initializers.zeros, (gates,))
         bias = bias + self.param("bias_hh", nn.initializers.zeros, (gates,))
-        offset = product(aside, self.param("kernel_aside", uniform, (aside.shape[-1], gates)),
-                         jnp.float32) + bias  # fmt: skip
+        weights = kernel, kernel_aside, bias
         records = self.is_mutable_collection(TAPE)
         if x.ndim == 2:
-            after, memory = lstm_step(kernel, carry, x, offset, fresh, self.dtype)
+            after, memory = lstm_step(weights, carry, x, aside, fresh, self.dtype)
             if records:
                 self.put_variable(TAPE, "memory", memory)
             return after, after[0]
         if self.has_variable(TAPE, "memory") and not records:
             memory = self.get_variable(TAPE, "memory")
-            hidden, cell = recall_lstm(kernel, carry, x, offset, fresh, self.dtype, memory)
+            hidden, cell = recall_lstm(weights, carry, x, aside, fresh, self.dtype, memory)
             return (hidden[-1], cell[-1]), hidden
 
         def body(carry: Carry, inputs: tuple[jax.Array, ...]) -> tuple[Carry, jax.Array]:
-            after, _ = lstm_step(kernel, carry, *inputs, self.dtype)
+            after, _ = lstm_step(weights, carry, *inputs, self.dtype)
             return after, after[0]
 
-        return jax.lax.scan(body, carry, (x, offset, fresh))
+        return jax.lax.scan(body, carry, (x, aside, fresh))
 
+
+#: An LSTM's kernel [n + H, 4 H], its rows for the inputs in `aside` [m, 4 H], and its bias [4 H].
+Weights = tuple[jax.Array, jax.Array, jax.Array]
 
 #: What one LSTM step keeps for the backward pass: the four gates after their nonlinearity
-#: [B, 4 H], the cell [B, H], and [x, h] transposed [n + H, B] in the operands' dtype.
+#: [B, 4 H], the cell [B, H], and [x, h] transposed [n + H, B] and packed.
 Memory = tuple[jax.Array, jax.Array, jax.Array]
 
 
@@ -208,38 +226,40 @@ def _clear(carry: Carry, fresh: jax.Array) -> Carry:
 
 
 def lstm_step(
-    kernel: jax.Array,
+    weights: Weights,
     carry: Carry,
     x: jax.Array,
-    offset: jax.Array,
+    aside: jax.Array,
     fresh: jax.Array,
     dtype: Any,
 ) -> tuple[Carry, Memory]:
     """One LSTM step over a batch; the carry of fresh rows is zeroed first.
 
     Args:
-      kernel: [n + H, 4 H].
+      weights: kernel, kernel_aside and bias.
       carry: (h, c), each [B, H].
       x: [B, n].
-      offset: [B, 4 H], what is added to the product: biases and further inputs.
+      aside: [B, m].
       fresh: [B] bool.
-      dtype: of the product's operands.
+      dtype: of the large product's operands.
     """
+    kernel, kernel_aside, bias = weights
     hidden, cell = _clear(carry, fresh)
     inputs = jnp.concatenate([x.astype(dtype), hidden.astype(dtype)], axis=-1)
-    i, f, g, o = jnp.split(product(inputs, kernel, dtype) + offset, 4, axis=-1)
+    z = product(inputs, kernel, dtype) + (product(aside, kernel_aside, jnp.float32) + bias)
+    i, f, g, o = jnp.split(z, 4, axis=-1)
     i, f, g, o = jax.nn.sigmoid(i), jax.nn.sigmoid(f), jnp.tanh(g), jax.nn.sigmoid(o)
     cell = f * cell + i * g
-    memory = jnp.concatenate([i, f, g, o], axis=-1), cell, inputs.T
+    memory = jnp.concatenate([i, f, g, o], axis=-1), cell, _pack(inputs.T)
     return (o * jnp.tanh(cell), cell), memory
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(5,))
 def recall_lstm(
-    kernel: jax.Array,
+    weights: Weights,
     carry: Carry,
     x: jax.Array,
-    offset: jax.Array,
+    aside: jax.Array,
     fresh: jax.Array,
     dtype: Any,
     memory: Memory,
@@ -250,27 +270,27 @@ def recall_lstm(
 
 
 def _recall_lstm_fwd(
-    kernel: jax.Array,
+    weights: Weights,
     carry: Carry,
     x: jax.Array,
-    offset: jax.Array,
+    aside: jax.Array,
     fresh: jax.Array,
     dtype: Any,
     memory: Memory,
 ) -> tuple[Carry, tuple]:
-    out = recall_lstm(kernel, carry, x, offset, fresh, dtype, memory)
-    return out, (kernel, carry, fresh, memory)
+    out = recall_lstm(weights, carry, x, aside, fresh, dtype, memory)
+    return out, (weights, carry, aside, fresh, memory)
 
 
 def _recall_lstm_bwd(dtype: Any, saved: tuple, cotangents: Carry) -> tuple:
-    kernel, carry, fresh, (gates, cell, inputs) = saved
+    (kernel, kernel_aside, bias), carry, aside, fresh, (gates, cell, inputs) = saved
     before = jnp.concatenate([carry[1][None], cell[:-1]])  # the cell that each step started from
     back = _transposed(kernel, dtype)  # [4 H, n + H]
     split = kernel.shape[0] - cell.shape[-1]  # n
 
     def body(grads: tuple, step: tuple) -> tuple[tuple, tuple]:
-        grad_hidden, grad_cell, grad_kernel = grads
-        gates_t, cell_t, before_t, inputs_t, fresh_t, out_hidden, out_cell = step
+        (grad_hidden, grad_cell), (grad_kernel, grad_aside, grad_bias) = grads
+        gates_t, cell_t, before_t, inputs_t, aside_t, fresh_t, out_hidden, out_cell = step
         i, f, g, o = jnp.split(gates_t, 4, axis=-1)
         tanh_cell = jnp.tanh(cell_t)
         grad_hidden = grad_hidden + out_hidden
@@ -288,15 +308,17 @@ def _recall_lstm_bwd(dtype: Any, saved: tuple, cotangents: Carry) -> tuple:
         rounded = grad_z.astype(dtype)
         grad_inputs = _dot(rounded, back, dtype)
         earlier = _clear((grad_inputs[:, split:], grad_cell * f), fresh_t)
-        grad_kernel = grad_kernel + _dot(inputs_t, rounded, dtype)
-        return (*earlier, grad_kernel), (grad_inputs[:, :split], grad_z)
+        grad_weights = (
+            grad_kernel + _dot(_unpack(inputs_t), rounded, dtype),
+            grad_aside + aside_t.T @ grad_z,
+            grad_bias + grad_z.sum(axis=0),
+        )
+        return (earlier, grad_weights), (grad_inputs[:, :split], grad_z @ kernel_aside.T)
 
-    zeros = (jnp.zeros_like(carry[0]), jnp.zeros_like(carry[1]), jnp.zeros(kernel.shape))
-    steps = (gates, cell, before, inputs, fresh, *cotangents)
-    (grad_h, grad_c, grad_kernel), (grad_x, grad_offset) = jax.lax.scan(
-        body, zeros, steps, reverse=True
-    )
-    return grad_kernel, (grad_h, grad_c), grad_x, grad_offset, None, None
+    zeros = jax.tree.map(jnp.zeros_like, (carry, (kernel, kernel_aside, bias)))
+    steps = (gates, cell, before, inputs, aside, fresh, *cotangents)
+    (grad_carry, grad_weights), grad_inputs = jax.lax.scan(body, zeros, steps, reverse=True)
+    return grad_weights, grad_carry, *grad_inputs, None, None
 
 
 recall_lstm.defvjp(_recall_lstm_fwd, _recall_lstm_bwd)

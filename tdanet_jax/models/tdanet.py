@@ -115,7 +115,7 @@ class TDANetEncoder(nn.Module):
         # The all-zero row of an empty frame has no word vector either.
         worded = jnp.where(obs.mask, weights, 0.0)
         boxes = jnp.einsum("...k,...ki->...i", weights, obs.boxes)
-        names = jnp.einsum("...k,...kd->...d", worded, table.words[obs.classes])
+        names = pool(worded, obs.classes, table.words)
         features = self.branch(jnp.concatenate([boxes, names], axis=-1))
         if self.siamese:
             features = jnp.abs(features - table.reference[obs.target])
@@ -124,3 +124,32 @@ class TDANetEncoder(nn.Module):
         if not self.siamese and not self.target_attention:
             features = jnp.concatenate([features, table.words[obs.target]], axis=-1)
         return nn.relu(self.linear4(nn.relu(self.linear3(features))))
+
+
+@jax.custom_vjp
+def pool(weights: jax.Array, classes: jax.Array, words: jax.Array) -> jax.Array:
+    """The weighted sum of the word vectors of the detections' classes.
+
+    Args:
+      weights: [..., K].
+      classes: [..., K] int32.
+      words: [C, D]; constant, they get no gradient.
+
+    Returns:
+      [..., D].
+    """
+    return jnp.einsum("...k,...kd->...d", weights, words[classes])
+
+
+def _pool_fwd(weights: jax.Array, classes: jax.Array, words: jax.Array) -> tuple[jax.Array, tuple]:
+    return pool(weights, classes, words), (classes, words)
+
+
+def _pool_bwd(saved: tuple, cotangent: jax.Array) -> tuple:
+    """One product with the words of all classes, then a look-up per detection."""
+    classes, words = saved
+    by_class = cotangent @ words.T  # [..., C]
+    return jnp.take_along_axis(by_class, classes, axis=-1), None, None
+
+
+pool.defvjp(_pool_fwd, _pool_bwd)
