@@ -15,19 +15,23 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from experiments.console import StopRequest, console, fail, one_line_errors, reporter
+from experiments.console import (
+    StopRequest,
+    console,
+    fail,
+    one_line_errors,
+    print_summary,
+    reporter,
+)
 from tdanet_jax import config as configs
-from tdanet_jax.config import PRESETS, TrainConfig
+from tdanet_jax.config import CONFIG_FILE, PRESETS, TrainConfig
 
 if TYPE_CHECKING:
-    from tdanet_jax.episodes import Episodes
-    from tdanet_jax.training import Row, Run
-
-CONFIG_FILE = "config.json"
+    from tdanet_jax.training import Row
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +86,7 @@ def default_folder(config: TrainConfig) -> Path:
 
 def train(config: TrainConfig, folder: Path, tensorboard: bool) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
-    from tdanet_jax import episodes, figures, scenes, words
+    from tdanet_jax import episodes, evaluation, figures, policies, report, scenes, words
     from tdanet_jax.task import make_task, resolve_precision
     from tdanet_jax.training import Run, read_metrics
 
@@ -99,9 +103,9 @@ def train(config: TrainConfig, folder: Path, tensorboard: bool) -> None:
     console.print(f"{config.model}, split {task.split.name}, seed {config.seed} -> {folder}")
     console.print("compiling ...")
     saved = run.seconds
-    with reporter("training", every=10) as report, metrics_sink(folder, tensorboard) as sink:
+    with reporter("training", every=10) as show, metrics_sink(folder, tensorboard) as sink:
         for row in run.chunks():
-            report(
+            show(
                 run.progress,
                 f"{row['steps_per_second']:,.0f} steps/s  {row['episodes']:,} episodes  "
                 f"SR {100 * row['success']:.1f}  SPL {100 * row['spl']:.1f}  "
@@ -122,30 +126,10 @@ def train(config: TrainConfig, folder: Path, tensorboard: bool) -> None:
     title = f"{config.model}, split {task.split.name}, seed {config.seed}"
     figures.learning_curve(read_metrics(folder), title, folder / "learning_curve.png")
     console.print("evaluating ...")
-    out = evaluate(run, lists)
-    for group in ("seen", "unseen"):
-        if out[group] is not None:
-            console.print(summary_line(group, out[group]["L>=1"]))
-    console.print(f"wrote {folder / 'results.md'}")
-
-
-def evaluate(run: Run, lists: dict[str, Episodes]) -> dict[str, Any]:
-    """Plays the fixed episodes with sampled actions and writes the results; returns them."""
-    import jax
-
-    from tdanet_jax import evaluation, policies, report
-
-    config, task = run.config, run.task
     policy = policies.network(run.model, task.words)
-    key = jax.random.key(config.seed)
-    played = {}
-    for i, (group, chosen) in enumerate(lists.items()):
-        group_key = jax.random.fold_in(key, i)
-        weights = run.state.params
-        played[group] = (
-            chosen,
-            evaluation.evaluate(policy, weights, task.eval_params, chosen, group_key),
-        )
+    played = evaluation.evaluate_lists(
+        policy, run.state.params, task.eval_params, lists, config.seed
+    )
     provenance = report.Provenance(
         split=task.split.name,
         model=config.model,
@@ -153,18 +137,10 @@ def evaluate(run: Run, lists: dict[str, Episodes]) -> dict[str, Any]:
         episodes_trained=int(run.state.episodes),
         seed=config.seed,
         steps=run.steps,
-        data_version=task.tables.data_version,
+        data_version=tables.data_version,
     )
-    return report.write(run.folder, provenance, task.tables, played)
-
-
-def summary_line(group: str, bucket: dict[str, Any]) -> str:
-    """seen targets, 1000 episodes: SR 75.1 (70.2 to 80.0), SPL ..."""
-    parts = []
-    for name in ("SR", "SPL"):
-        low, high = bucket[f"{name}_ci"]
-        parts.append(f"{name} {bucket[name]:.1f} ({low:.1f} to {high:.1f})")
-    return f"{group} targets, {bucket['n']} episodes: {', '.join(parts)}"
+    print_summary(report.write(folder, provenance, tables, played))
+    console.print(f"wrote {folder / 'results.md'}")
 
 
 @contextlib.contextmanager

@@ -11,6 +11,8 @@ from typing import Any, Literal
 from tdanet_jax.vocabulary import UNSEEN
 
 MODELS = ("tdanet",)
+#: Name of the file in a run's folder that holds its configuration.
+CONFIG_FILE = "config.json"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -106,7 +106,7 @@ def load(tables: SceneTables, split: Split) -> dict[str, Episodes]:
         if version != tables.data_version:
             raise ValueError(
                 f"{ASSET} belongs to scene tables {version}, these are {tables.data_version}: "
-                "reinstall tdanet_jax, or after a change to the rooms run `python -m experiments.scenes build`"
+                "reinstall tdanet_jax, or run `python -m experiments.scenes build`"
             )
         return {
             group: Episodes(

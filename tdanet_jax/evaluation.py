@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -41,6 +42,17 @@ def evaluate(
     pose, target = jnp.asarray(episodes.pose), jnp.asarray(episodes.target)
     out = jax.device_get(_play(policy, limit, weights, params, pose, target, key))
     return Records(*out)
+
+
+def evaluate_lists(
+    policy: Policy, weights: Any, params: EnvParams, lists: Mapping[str, Episodes], seed: int
+) -> dict[str, tuple[Episodes, Records]]:
+    """`evaluate` on every list of a split, each with a random stream of its own."""
+    key = jax.random.key(seed)
+    return {
+        group: (chosen, evaluate(policy, weights, params, chosen, jax.random.fold_in(key, i)))
+        for i, (group, chosen) in enumerate(lists.items())
+    }
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

@@ -34,7 +34,6 @@ class Run:
         self.seconds = 0.0
         self.checkpoints = Checkpoints(folder)
         self.state: TrainState = self._make_state() if self.fresh else self._restore()
-        self._drop_rows_after(int(self.state.updates))
 
     @property
     def fresh(self) -> bool:
@@ -89,6 +88,7 @@ class Run:
         Compilation is not counted as training time. Stop iterating to stop training; `save` then
         keeps what is done.
         """
+        self._drop_rows_after(int(self.state.updates))
         chunk = self._compile()
         while self.progress < 1.0:
             before = self.progress

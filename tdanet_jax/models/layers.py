@@ -145,8 +145,7 @@ class Linear(nn.Module):
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         records = self.is_mutable_collection(TAPE)
         if self.has_variable(TAPE, "product") and not records:
-            value, transposed = self.get_variable(TAPE, "product")
-            return recall_product(x, kernel, self.dtype, value, transposed) + bias
+            return recall_product(x, kernel, self.dtype, *self.get_variable(TAPE, "product")) + bias
         y = product(x, kernel, self.dtype)
         if records:
             kept = _keeps_transposed(self.dtype)
@@ -203,8 +202,9 @@ class LSTM(nn.Module):
             hidden, cell = recall_lstm(weights, carry, x, aside, fresh, self.dtype, memory)
             return (hidden[-1], cell[-1]), hidden
 
-        def body(carry: Carry, inputs: tuple[jax.Array, ...]) -> tuple[Carry, jax.Array]:
-            after, _ = lstm_step(weights, carry, *inputs, self.dtype)
+        def body(carry: Carry, inputs: tuple) -> tuple[Carry, jax.Array]:
+            x, aside, fresh = inputs
+            after, _ = lstm_step(weights, carry, x, aside, fresh, self.dtype)
             return after, after[0]
 
         return jax.lax.scan(body, carry, (x, aside, fresh))
