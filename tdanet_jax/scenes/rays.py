@@ -54,7 +54,9 @@ def blocked_by_box(
     enter, leave = jnp.minimum(one, other), jnp.maximum(one, other)
     hit = (leave > 0).all(axis=0) & (enter < step).all(axis=0)
     for i, j in ((0, 1), (1, 2), (2, 0)):
-        hit &= (enter[i] * step[j] < leave[j] * step[i]) & (enter[j] * step[i] < leave[i] * step[j])
+        overlap = enter[i] * step[j] < leave[j] * step[i]
+        overlap &= enter[j] * step[i] < leave[i] * step[j]
+        hit &= overlap | ((step[i] | step[j]) == 0)  # along the third axis: nothing to compare
     through = (leave < step).any(axis=0)
     return hit & (through | (kind == CLOSED))
 

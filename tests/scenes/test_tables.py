@@ -1,0 +1,168 @@
+"""The tables' invariants, their subsets, and their way to disk and back."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tdanet_jax.scenes import SceneError, SceneTables, geometry, tables, toy
+from tdanet_jax.scenes.scene import Scene
+from tdanet_jax.vocabulary import ALL_TARGETS
+
+# Of the bundled rooms. A change means that every published number has to be measured anew.
+DATA_VERSION = "d4909be88f83"
+
+
+def random_rooms(seed: int) -> list[Scene]:
+    draw = np.random.default_rng(seed)
+    return [toy.random_room(draw, name=f"Room{i}") for i in range(3)]
+
+
+@pytest.fixture(scope="module")
+def rooms() -> SceneTables:
+    return tables.build(random_rooms(0))
+
+
+def test_the_bundled_rooms_are_the_same_everywhere(ithor: SceneTables) -> None:
+    assert ithor.data_version == DATA_VERSION
+    assert len(ithor.scenes) == 120
+    assert len(ithor.position) == 14_642
+    assert ithor.targets == ALL_TARGETS
+    assert len(ithor.classes) == 117
+
+
+@pytest.mark.parametrize("which", ["rooms", "some_rooms"])
+def test_invariants(which: str, request: pytest.FixtureRequest) -> None:
+    t: SceneTables = request.getfixturevalue(which)
+    states = t.num_states
+    assert t.row_start[0] == 0
+    assert t.row_start[-1] == len(t.row_object) == len(t.row_box) == len(t.row_visible)
+    assert (np.diff(t.row_start) >= 0).all()
+    # Rows stay in their scene and are sorted by class and object within a state.
+    assert (t.object_scene[t.row_object] == t.state_scene[t.row_state]).all()
+    key = (t.row_state.astype(np.int64) * len(t.classes) + t.row_class) * len(t.object_id)
+    assert (np.diff(key + t.row_object) > 0).all()
+    x1, y1, x2, y2 = t.row_box.T
+    assert ((x1 >= 0) & (y1 >= 0) & (x2 <= 4800) & (y2 <= 4800)).all()
+    assert ((x1 <= x2) & (y1 <= y2)).all()
+    # Steps stay in their scene and move a grid step, along both axes at odd headings.
+    assert (t.position_scene[t.next_position] == t.position_scene[:, None]).all()
+    moved = t.position[t.next_position] - t.position[:, None]
+    stays = t.next_position == np.arange(len(t.position))[:, None]
+    length = np.hypot(moved[..., 0], moved[..., 2])
+    expected = np.where(np.arange(8) % 2, np.sqrt(0.125), 0.25)
+    assert np.allclose(length, np.where(stays, 0, expected))
+    assert t.raster.shape == (states, 7, 7)
+    assert t.distance.shape == (states, len(t.targets))
+
+
+@pytest.mark.parametrize("which", ["rooms", "some_rooms"])
+def test_distance_is_zero_exactly_where_visible(which: str, request: pytest.FixtureRequest) -> None:
+    t: SceneTables = request.getfixturevalue(which)
+    bits = t.visible_bits()
+    for goal, target in enumerate(t.targets):
+        if target in t.classes:
+            c = t.classes.index(target)
+            visible = (bits[:, c // 32] >> np.uint32(c % 32)) & 1
+            assert ((t.distance[:, goal] == 0) == visible).all()
+        else:
+            assert (t.distance[:, goal] == -1).all()
+
+
+def test_distances_fall_by_one_along_some_action(some_rooms: SceneTables) -> None:
+    t = some_rooms
+    successor = geometry.transitions(t.next_position)
+    after = t.distance[successor]  # [S, 5, G]
+    least = np.where(after < 0, 30_000, after).min(axis=1)
+    way = t.distance > 0
+    assert (least[way] == t.distance[way] - 1).all()
+    assert (after[np.broadcast_to((t.distance < 0)[:, None], after.shape)] == -1).all()
+
+
+def test_visible_bits_by_hand(rooms: SceneTables) -> None:
+    bits = rooms.visible_bits()
+    for state in range(0, rooms.num_states, 7):
+        rows = slice(rooms.row_start[state], rooms.row_start[state + 1])
+        want = set(rooms.row_class[rows][rooms.row_visible[rows]].tolist())
+        got = {c for c in range(len(rooms.classes)) if bits[state, c // 32] >> (c % 32) & 1}
+        assert got == want
+
+
+def test_merged_rows_by_hand(rooms: SceneTables) -> None:
+    merged = rooms.merged()
+    for state in range(0, rooms.num_states, 5):
+        rows = np.arange(rooms.row_start[state], rooms.row_start[state + 1])
+        some = slice(merged.start[state], merged.start[state + 1])
+        labels = sorted(set(rooms.row_class[rows].tolist()))
+        assert merged.object_class[some].tolist() == labels
+        for label, box in zip(labels, merged.box[some], strict=True):
+            parts = rooms.row_box[rows[rooms.row_class[rows] == label]]
+            assert box.tolist() == [*parts[:, :2].min(axis=0), *parts[:, 2:].max(axis=0)]
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=5)
+def test_a_subset_is_what_its_rooms_alone_would_give(seed: int) -> None:
+    scenes = random_rooms(seed)
+    whole = tables.build(scenes)
+    alone = tables.build([scenes[0], scenes[2]], classes=whole.classes)
+    assert whole.subset(["Room2", "Room0"]).data_version == alone.data_version
+
+
+def test_subset_of_unknown_scene(rooms: SceneTables) -> None:
+    with pytest.raises(SceneError, match="Room9"):
+        rooms.subset(["Room0", "Room9"])
+
+
+def test_saved_tables_come_back(rooms: SceneTables, tmp_path: Path) -> None:
+    path = tmp_path / "tables.npz"
+    rooms.save(path)
+    back = SceneTables.load(path)
+    for field in dataclasses.fields(rooms):
+        ours, theirs = getattr(rooms, field.name), getattr(back, field.name)
+        if isinstance(ours, np.ndarray):
+            assert ours.dtype == theirs.dtype
+            assert (ours == theirs).all()
+        else:
+            assert ours == theirs
+    assert back.data_version == rooms.data_version
+
+
+@pytest.mark.parametrize("field", [field.name for field in dataclasses.fields(SceneTables)])
+def test_the_version_follows_every_field(rooms: SceneTables, field: str) -> None:
+    value = getattr(rooms, field)
+    if isinstance(value, np.ndarray):
+        changed = value.copy()
+        changed.flat[-1] = ~changed.flat[-1] if value.dtype == bool else changed.flat[-1] + 1
+    elif isinstance(value, tuple):
+        changed = (*value[:-1], value[-1] + "x")
+    else:
+        changed = value + 1
+    other = dataclasses.replace(rooms, **{field: changed})
+    assert other.data_version != rooms.data_version
+
+
+def test_class_outside_the_vocabulary() -> None:
+    with pytest.raises(SceneError, match=r"Corridor: Apple\|0: class Apple"):
+        tables.build([toy.corridor()], classes=("Mug",))
+
+
+def test_corridor_by_hand() -> None:
+    t = tables.build([toy.corridor()], rules=dataclasses.replace(tables.RULES, void=100.0))
+    apple = t.targets.index("Apple")
+    ahead = t.distance[::16, apple]  # heading 0, horizon 0, from every point
+    assert ahead.tolist() == [3, 2, 1, 0, 0]
+    assert t.distance[4 * 2, apple] == 4 + 3  # from the first point, looking back
+    assert t.raster[0, 3, 3] == t.classes.index("Apple")
+    assert (t.raster[4 * 2] == -1).all()
+
+
+def test_a_room_in_which_nothing_is_seen() -> None:
+    t = tables.build([toy.room(toy.line(1), toy.thing("Apple", (0.0, 3.9, 0.0)))])
+    assert len(t.row_object) == 0
+    assert (t.distance == -1).all()
+    assert not t.visible_bits().any()
+    assert len(t.merged().box) == 0
