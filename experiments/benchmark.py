@@ -1,0 +1,332 @@
+"""Measures this machine and the software on it; compile time and run time apart.
+
+    python -m experiments.benchmark --out benchmark.jsonl
+
+Every figure is the median over repetitions. Shares of the peak count 6 floating-point operations
+(forward and backward) per multiply-accumulate of one forward step, by hand formula: work that is
+done twice earns nothing. The peak is the best rate of a float32 product of batch x 1024 by
+1024 x 2048, measured in the same run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+from rich.table import Table
+
+from experiments.console import console, fail, one_line_errors
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+
+if TYPE_CHECKING:
+    import jax
+
+    from tdanet_jax.models.actor_critic import ActorCritic
+    from tdanet_jax.task import Task
+
+Row = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Measures env, rollout, update, evaluation and one decision on this machine."""
+
+    parts: tuple[Literal["machine", "environment", "update", "evaluation", "decision"], ...] = (
+        "machine",
+        "environment",
+        "update",
+        "evaluation",
+        "decision",
+    )
+    """What to measure."""
+    environments: tuple[int, ...] = (1024, 4096, 16384)
+    """Numbers of environments in the `environment` part."""
+    batches: tuple[int, ...] = (256, 512, 1024)
+    """Numbers of environments in the `update` part."""
+    precisions: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
+    """Operands of the products in the `update` part."""
+    repeats: int = 5
+    """Timed repetitions of each figure."""
+    out: Path | None = None
+    """File for the figures, one JSON object per line; must not exist."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command."""
+    command = tyro.cli(Command, args=sys.argv[1:] if arguments is None else arguments)
+    with one_line_errors():
+        if command.out is not None and command.out.exists():
+            fail(f"--out {command.out}: exists")
+        if command.repeats < 1:
+            fail(f"--repeats {command.repeats}: must be positive")
+        rows = []
+        for row in measure(command):
+            rows.append(row)
+            console.print(json.dumps(row))
+        console.print(as_table(rows))
+        if command.out is not None:
+            command.out.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+def measure(command: Command) -> Iterator[Row]:
+    """All figures that were asked for, one row each."""
+    import jax
+
+    from tdanet_jax import scenes, words
+    from tdanet_jax.task import make_task
+
+    began = time.perf_counter()
+    tables = scenes.load_tables()
+    task = make_task(TrainConfig(), tables, words.load_bundled())
+    yield {
+        "part": "start",
+        "device": str(jax.devices()[0]),
+        "processor": processor(),
+        "jax": jax.__version__,
+        "tables_seconds": round(time.perf_counter() - began, 2),
+    }
+    peak = None
+    if "machine" in command.parts:
+        machine = machine_row(command.repeats)
+        peak = machine["float32_gflops"]
+        yield machine
+    if "environment" in command.parts:
+        for count in command.environments:
+            for observed in (False, True):
+                yield environment_row(task, count, observed, command.repeats)
+    if "update" in command.parts:
+        for precision in command.precisions:
+            for count in command.batches:
+                yield update_row(task, precision, count, peak, command.repeats)
+    if "evaluation" in command.parts:
+        yield evaluation_row(task, tables, command.repeats)
+    if "decision" in command.parts:
+        for count in (1, 1024):
+            yield decision_row(task, count, command.repeats)
+
+
+def timed(call: Callable[[], Any], repeats: int, inner: int = 1) -> tuple[float, float]:
+    """Seconds of the first call (compilation included) and the median of later ones.
+
+    A repetition makes `inner` calls; the median is per call.
+    """
+    import jax
+
+    began = time.perf_counter()
+    jax.block_until_ready(call())
+    first = time.perf_counter() - began
+    taken = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        for _ in range(inner):
+            out = call()
+        jax.block_until_ready(out)
+        taken.append((time.perf_counter() - began) / inner)
+    return first, statistics.median(taken)
+
+
+def machine_row(repeats: int) -> Row:
+    """The machine's own limits: matrix products and memory."""
+    import jax
+    import jax.numpy as jnp
+
+    @jax.jit
+    def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.dot(a, b, preferred_element_type=jnp.float32)
+
+    add_one = jax.jit(lambda x: x + 1)
+    row: Row = {"part": "machine"}
+    for name, dtype in (("float32", jnp.float32), ("bfloat16", jnp.bfloat16)):
+        best = 0.0
+        for batch in (512, 1024, 2048):
+            a = jax.random.normal(jax.random.key(0), (batch, 1024)).astype(dtype)
+            b = jax.random.normal(jax.random.key(1), (1024, 2048)).astype(dtype)
+            _, seconds = timed(functools.partial(multiply, a, b), 4 * repeats, inner=5)
+            best = max(best, 2 * batch * 1024 * 2048 / seconds / 1e9)
+        row[f"{name}_gflops"] = round(best, 1)
+    big = jnp.zeros(2**26, jnp.float32)
+    _, seconds = timed(functools.partial(add_one, big), repeats, inner=2)
+    row["bandwidth_gb_per_s"] = round(2 * big.nbytes / seconds / 1e9, 1)
+    return row
+
+
+def environment_row(task: Task, count: int, observed: bool, repeats: int) -> Row:
+    """Random actions, auto-reset included; with `observed`, every detection is read."""
+    import jax
+    import jax.numpy as jnp
+
+    from tdanet_jax import env
+    from tdanet_jax.vocabulary import NUM_ACTIONS
+
+    steps = 64
+
+    @jax.jit
+    def play(key: jax.Array, params: env.EnvParams) -> jax.Array:
+        reset_key, key = jax.random.split(key)
+        state = jax.vmap(env.reset_state, (0, None))(jax.random.split(reset_key, count), params)
+
+        def body(state: env.EnvState, key: jax.Array) -> tuple[env.EnvState, jax.Array]:
+            action_key, step_key = jax.random.split(key)
+            action = jax.random.randint(action_key, (count,), 0, NUM_ACTIONS, jnp.uint8)
+            keys = jax.random.split(step_key, count)
+            obs, state, reward, *_ = jax.vmap(env.step, (0, 0, 0, None))(
+                keys, state, action, params
+            )
+            total = reward.sum()
+            if observed:
+                total += obs.boxes.sum() + obs.classes.sum() + obs.mask.sum()
+            return state, total
+
+        _, totals = jax.lax.scan(body, state, jax.random.split(key, steps))
+        return totals.sum()
+
+    first, seconds = timed(lambda: play(jax.random.key(0), task.train_params), repeats)
+    return {
+        "part": "environment",
+        "environments": count,
+        "observations": observed,
+        "compile_seconds": round(first - seconds, 2),
+        "steps_per_second": round(count * steps / seconds),
+    }
+
+
+def forward_macs(model: ActorCritic, words_width: int) -> int:
+    """Multiply-accumulates of one forward step, by the sizes of its layers.
+
+    What is done once per update for the table of classes is not counted.
+    """
+    from tdanet_jax.vocabulary import NUM_ACTIONS
+
+    width, hidden = model.encoder.width, model.hidden
+    encoder = (3 + words_width) * width + 3 * width * width
+    action = NUM_ACTIONS * model.action_width
+    lstm = (width + model.action_width + hidden) * 4 * hidden
+    return encoder + action + lstm + hidden * (NUM_ACTIONS + 1)
+
+
+def update_row(task: Task, precision: str, count: int, peak: float | None, repeats: int) -> Row:
+    """Rollout, gradient and optimiser step, as the training command runs them."""
+    import jax
+    import jax.numpy as jnp
+
+    from tdanet_jax import learner
+    from tdanet_jax.task import make_model
+
+    network: Any = NetworkConfig(precision=precision)  # type: ignore[arg-type]
+    config = LearnerConfig(num_envs=count)
+    model = make_model(network)
+    words, params = task.train_words, task.train_params
+    updates = 5
+    chunk = learner.make_train(config, model, updates)
+    state = learner.init(jax.random.key(0), config, model, words, params)
+    share = jnp.zeros(2)
+    began = time.perf_counter()
+    compiled = chunk.lower(state, share, words, params).compile()
+    compile_seconds = time.perf_counter() - began
+
+    def call() -> Any:
+        nonlocal state
+        state, metrics = compiled(state, share, words, params)
+        return metrics
+
+    _, seconds = timed(call, repeats)
+    steps = count * config.rollout_steps * updates
+    gflops = 6 * forward_macs(model, words.shape[1]) * steps / seconds / 1e9
+    return {
+        "part": "update",
+        "precision": precision,
+        "environments": count,
+        "compile_seconds": round(compile_seconds, 2),
+        "steps_per_second": round(steps / seconds),
+        "gflops": round(gflops, 1),
+        "share_of_float32_peak": round(gflops / peak, 3) if peak else None,
+    }
+
+
+def evaluation_row(task: Task, tables: Any, repeats: int) -> Row:
+    """All episodes of a split, sampled actions of an untrained network (the longest case)."""
+    import jax
+
+    from tdanet_jax import episodes, evaluation, policies
+    from tdanet_jax.task import make_model
+
+    model = make_model(NetworkConfig())
+    weights = model.initialise(jax.random.key(0), task.words)
+    policy = policies.network(model, task.words)
+    lists = episodes.load(tables, task.split)
+
+    def call() -> Any:
+        played = evaluation.evaluate_lists(policy, weights, task.eval_params, lists, 0)
+        return [records.length for _, records in played.values()]
+
+    first, seconds = timed(call, repeats)
+    return {
+        "part": "evaluation",
+        "episodes": sum(len(chosen) for chosen in lists.values()),
+        "compile_seconds": round(first - seconds, 2),
+        "seconds": round(seconds, 2),
+    }
+
+
+def decision_row(task: Task, count: int, repeats: int) -> Row:
+    """One decision: an observation in, action probabilities out."""
+    import jax
+    import jax.numpy as jnp
+
+    from tdanet_jax import env
+    from tdanet_jax.models import actor_critic
+    from tdanet_jax.task import make_model
+
+    model = make_model(NetworkConfig())
+    weights = model.initialise(jax.random.key(0), task.words)
+    table = actor_critic.prepare(model, weights, task.words)
+    keys = jax.random.split(jax.random.key(1), count)
+    obs, _ = jax.vmap(env.reset, (0, None))(keys, task.eval_params)
+    carry, fresh = model.initial_carry(count), jnp.zeros(count, bool)
+    previous = jnp.zeros((count, 6))
+
+    @jax.jit
+    def decide(weights: Any, table: Any, carry: Any, obs: Any) -> Any:
+        return actor_critic.forward(model, weights, table, carry, obs, previous, fresh)
+
+    first, seconds = timed(lambda: decide(weights, table, carry, obs), 4 * repeats, inner=20)
+    return {
+        "part": "decision",
+        "batch": count,
+        "compile_seconds": round(first - seconds, 2),
+        "milliseconds": round(1e3 * seconds, 3),
+    }
+
+
+def processor() -> str:
+    """The processor's name, as far as the system tells."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def as_table(rows: list[Row]) -> Table:
+    """All rows as one table: the part, its setting, and its figures."""
+    table = Table("part", "setting", "figures")
+    settings = ("environments", "observations", "precision", "batch", "episodes")
+    for row in rows:
+        setting = ", ".join(f"{k} {row[k]}" for k in settings if k in row)
+        figures = ", ".join(f"{k} {v}" for k, v in row.items() if k not in (*settings, "part"))
+        table.add_row(row["part"], setting, figures)
+    return table
+
+
+if __name__ == "__main__":
+    main()
