@@ -134,11 +134,18 @@ def test_the_optimal_length_counts_done(rooms: SceneTables, params: EnvParams) -
     assert (records.length == 1).all()
 
 
-def test_who_never_says_done_is_stopped_by_the_limit_of_the_room(
+def test_who_says_done_too_late_is_stopped_by_the_limit_of_the_room(
     rooms: SceneTables, params: EnvParams
 ) -> None:
-    chosen = drawn(rooms, 5)
-    records = evaluation.evaluate(constant(Action.LOOK_UP), None, params, chosen, KEY)
+    def act(weights: Any, memory: Any, key: Any, state: env.EnvState, params: EnvParams) -> Any:
+        # Done comes one action too late: where the target is in view, it must not count any more.
+        limit = params.step_limit[params.position_room[state.pose // 16].astype(jnp.int32)]
+        late = state.steps >= limit
+        return memory, jnp.where(late, Action.DONE, Action.LOOK_UP)
+
+    chosen = drawn(rooms, 50)
+    records = evaluation.evaluate(Policy(lambda w, batch: (), act), None, params, chosen, KEY)
+    assert (records.shortest == 1).any()
     room_type = rooms.room_type[rooms.position_scene[chosen.pose // 16]]
     np.testing.assert_array_equal(records.length, np.array([100, 200, 100, 100])[room_type])
     assert not records.success.any()

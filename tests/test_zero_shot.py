@@ -250,6 +250,16 @@ def test_training_stays_in_the_training_rooms(
     assert not set(task.split.train_scenes) & set(task.split.eval_scenes)
 
 
+def test_nothing_of_the_evaluation_rooms_reaches_training(
+    rooms: SceneTables, glove: WordVectors
+) -> None:
+    config = config_of("18/4", False)
+    task = make_task(config, rooms, glove)
+    alone = make_task(config, rooms.subset(task.split.train_scenes), glove)
+    assert_identical(task.train_params, alone.train_params)
+    assert_identical(task.train_words, alone.train_words)
+
+
 def test_evaluation_sees_hidden_classes(rooms: SceneTables, glove: WordVectors) -> None:
     split = make_split("18/4")
     task = make_task(config_of("18/4", False), rooms, glove)
