@@ -28,9 +28,10 @@ def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> No
     entropy = right.twinx()
     entropy.plot(episodes, [row["entropy"] for row in rows], ":", color="0.3", label="entropy")
     entropy.set(ylabel="entropy of the policy (nats)", ylim=(0, None))
-    handles = [*right.get_lines(), *entropy.get_lines()]
-    right.legend(handles=handles, loc="upper right", frameon=False)
-    left.legend(loc="lower right", frameon=False)
+    # Above the axes, where no line runs.
+    place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 2, "frameon": False}
+    left.legend(**place)
+    right.legend(handles=[*right.get_lines(), *entropy.get_lines()], **place)
     for axis in (left, right):
         axis.set_xlabel("training episodes")
         axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x / 1000:,.0f}k"))
