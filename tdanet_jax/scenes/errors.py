@@ -3,3 +3,7 @@
 
 class SceneError(ValueError):
     """A scene breaks a rule; the message is one line naming scene, object and rule."""
+
+    def __init__(self, message: str) -> None:
+        # Names come from files and may hold line breaks.
+        super().__init__(" ".join(message.split()))

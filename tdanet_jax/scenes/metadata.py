@@ -92,7 +92,9 @@ def parse_object(scene: str, record: Mapping[str, Any]) -> SceneObject:
     rotation = np.zeros(3)
     if record.get("rotation") is not None:
         rotation = _vector(scene, name, record, "rotation")
-    parents = record.get("parentReceptacles") or ()
+    parents = record.get("parentReceptacles") or []
+    if not isinstance(parents, list) or not all(isinstance(p, str) for p in parents):
+        raise SceneError(f"{scene}: {name}: parentReceptacles is not a list of ids")
     return SceneObject(
         object_id=name,
         object_class=_text(scene, record, "objectType"),
@@ -195,7 +197,10 @@ def _agent(scene: str, agent: Any) -> tuple[np.ndarray | None, int | None]:
         raise SceneError(f"{scene}: agent is not metadata's agent record")
     position = _vector(scene, "agent", agent, "position")
     turn = _vector(scene, "agent", agent, "rotation")[1]
-    if abs(agent.get("cameraHorizon") or 0) > 1 or abs((turn + 22.5) % 45 - 22.5) > 1:
+    horizon = agent.get("cameraHorizon", 0.0)
+    if not _is_number(horizon):
+        raise SceneError(f"{scene}: agent: cameraHorizon is not a number")
+    if abs(horizon) > 1 or abs((turn + 22.5) % 45 - 22.5) > 1:
         return None, None
     return position, round(turn / 45) * 45 % 360
 

@@ -1,0 +1,68 @@
+"""The command: what it writes, and one clear line where it cannot."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from experiments import scenes
+from tdanet_jax.scenes import SceneTables
+from tests.scenes.test_metadata import DOCUMENT
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path) -> Path:
+    path = tmp_path / "lab.json"
+    path.write_text(json.dumps(DOCUMENT))
+    return path
+
+
+def test_import(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = scene_file.with_name("lab.npz")
+    scenes.main(["import", str(scene_file), "--out", str(out)])
+    tables = SceneTables.load(out)
+    assert tables.scenes == ("Lab",)
+    assert tables.classes == ("Desk", "Mug")
+    assert tables.data_version in capsys.readouterr().out
+    assert sorted(p.name for p in out.parent.iterdir()) == ["lab.json", "lab.npz"]
+
+
+def test_inspect_own_and_bundled_rooms(scene_file: Path) -> None:
+    out = scene_file.with_name("lab.png")
+    scenes.main(["inspect", "Lab", "--scenes", str(scene_file), "--out", str(out)])
+    assert out.stat().st_size > 10_000
+    pose = ["--position", "-3", "2", "--rotation", "90", "--horizon", "30", "--out", str(out)]
+    scenes.main(["inspect", "FloorPlan430", *pose])
+
+
+def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as stop:
+        scenes.main(arguments)
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert message.startswith("error: ")
+    assert message.count("\n") == 1
+    return message
+
+
+def test_bad_input(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    here = scene_file.parent
+    assert "FloorPlan0" in fails(["inspect", "FloorPlan0"], capsys)
+    pose = ["--position", "0", "0", "--rotation", "50", "--out", str(here / "a.png")]
+    assert "50" in fails(["inspect", "FloorPlan1", *pose], capsys)
+    assert "nope.json" in fails(["import", str(here / "nope.json"), "--out", "x"], capsys)
+    assert "lab.json" in fails(["import", str(scene_file), "--out", str(scene_file)], capsys)
+    (here / "bad.json").write_text(json.dumps({**DOCUMENT, "objects": []}))
+    out = here / "bad.npz"
+    assert "Lab: no objects" in fails(["import", str(here / "bad.json"), "--out", str(out)], capsys)
+    assert "FloorPlan1=hall" in fails(["collect", "FloorPlan1=hall"], capsys)
+    assert sorted(p.name for p in here.iterdir()) == ["bad.json", "lab.json"]
+
+
+def test_verify(capsys: pytest.CaptureFixture[str]) -> None:
+    scenes.main(["verify", "--rooms", "2", "--views", "1", "--worst", "3"])
+    lines = capsys.readouterr().out.splitlines()
+    [everything] = [line for line in lines if line.startswith("all classes")]
+    assert everything.split()[2:5] == ["358", "16", "19"]
+    assert any(line.startswith("Boxes against") for line in lines)
+    assert any("Painting" in line and "FloorPlan313" in line for line in lines)

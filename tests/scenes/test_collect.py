@@ -1,0 +1,60 @@
+"""The collector against a controller that only pretends."""
+
+import copy
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tdanet_jax.scenes import SceneError, collect, metadata
+from tests.scenes.test_metadata import DOCUMENT
+
+
+class FakeController:
+    """Answers as AI2-THOR's controller does, with more fields than are needed."""
+
+    def __init__(self, works: bool = True) -> None:
+        self.works = works
+        self.asked: list[Any] = []
+
+    def reset(self, scene: str, gridSize: float) -> SimpleNamespace:
+        self.asked.append((scene, gridSize))
+        content = copy.deepcopy(DOCUMENT)
+        records = [{**record, "mass": 1.0} for record in content["objects"]]
+        return SimpleNamespace(metadata={"objects": records, "agent": content["agent"]})
+
+    def step(self, action: str) -> SimpleNamespace:
+        self.asked.append(action)
+        return SimpleNamespace(
+            metadata={
+                "lastActionSuccess": self.works,
+                "errorMessage": "" if self.works else "broken",
+                "actionReturn": DOCUMENT["reachable_positions"],
+            }
+        )
+
+
+def test_what_is_collected_can_be_read(tmp_path: Path) -> None:
+    controller = FakeController()
+    documents = collect.collect(controller, [("FloorPlan1", "kitchen"), ("Mine", "bathroom")])
+    assert controller.asked == [
+        ("FloorPlan1", 0.25),
+        "GetReachablePositions",
+        ("Mine", 0.25),
+        "GetReachablePositions",
+    ]
+    path = tmp_path / "scenes.json"
+    path.write_text("an older file")
+    collect.write_scenes(documents, path)
+    first, second = metadata.read_scenes(path)
+    assert (first.name, first.room_type) == ("FloorPlan1", 0)
+    assert (second.name, second.room_type) == ("Mine", 3)
+    assert len(first.objects) == 2
+    assert first.default_rotation == 270
+    assert [p.name for p in tmp_path.iterdir()] == ["scenes.json"]
+
+
+def test_a_failed_action() -> None:
+    with pytest.raises(SceneError, match="FloorPlan1: GetReachablePositions: broken"):
+        collect.collect(FakeController(works=False), [("FloorPlan1", "kitchen")])

@@ -1,0 +1,180 @@
+"""Scene files: what they mean, and that broken ones are refused in one line."""
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tdanet_jax.scenes import SceneError, metadata
+
+BOX = {"center": {"x": 0.0, "y": 1.5, "z": 1.0}, "size": {"x": 0.2, "y": 0.2, "z": 0.2}}
+DOCUMENT: dict[str, Any] = {
+    "name": "Lab",
+    "room_type": "bedroom",
+    "reachable_positions": [{"x": 0.1, "y": 0.9, "z": 0.25 * i} for i in (2, 0, 1)],
+    "objects": [
+        {
+            "objectId": "Mug|1",
+            "objectType": "Mug",
+            "axisAlignedBoundingBox": BOX,
+            "parentReceptacles": ["Floor|0", "Desk|0"],
+            "visible": True,
+        },
+        {"objectId": "Floor|0", "objectType": "Floor", "axisAlignedBoundingBox": None},
+        {
+            "objectId": "Desk|0",
+            "objectType": "Desk",
+            "axisAlignedBoundingBox": BOX,
+            "isOpen": True,
+            "rotation": {"x": 0, "y": 45, "z": 0},
+        },
+    ],
+    "agent": {
+        "position": {"x": 0.1, "y": 0.9, "z": 0.0},
+        "rotation": {"x": 0.0, "y": 269.9, "z": 0.0},
+        "cameraHorizon": 0.0,
+    },
+}
+
+
+def read(tmp_path: Path, document: Any) -> Any:
+    path = tmp_path / "scenes.json"
+    path.write_text(document if isinstance(document, str) else json.dumps(document))
+    return metadata.read_scenes(path)
+
+
+def test_a_scene_file(tmp_path: Path) -> None:
+    [scene] = read(tmp_path, DOCUMENT)
+    assert (scene.name, scene.room_type) == ("Lab", 2)
+    assert scene.points[:, 2].tolist() == [0.0, 0.25, 0.5]
+    assert [item.object_id for item in scene.objects] == ["Desk|0", "Mug|1"]
+    desk, mug = scene.objects
+    assert np.allclose(mug.box, [(-0.1, 1.4, 0.9), (0.1, 1.6, 1.1)])
+    assert mug.parents == ("Desk|0",)
+    assert mug.visible is True
+    assert desk.visible is None
+    assert desk.is_open
+    assert desk.rotation == (0.0, 45.0, 0.0)
+    assert scene.default_rotation == 270
+    assert np.allclose(scene.default_position, (0.1, 0.9, 0.0))
+
+
+def test_a_list_of_scenes(tmp_path: Path) -> None:
+    other = {**DOCUMENT, "name": "Den", "agent": None}
+    first, second = read(tmp_path, [DOCUMENT, other])
+    assert (first.name, second.name) == ("Lab", "Den")
+    assert second.default_position is None
+
+
+@pytest.mark.parametrize(("horizon", "turn"), [(30.0, 0.0), (0.0, 20.0)])
+def test_odd_poses_are_not_default_frames(tmp_path: Path, horizon: float, turn: float) -> None:
+    document = copy.deepcopy(DOCUMENT)
+    document["agent"]["cameraHorizon"] = horizon
+    document["agent"]["rotation"]["y"] = turn
+    [scene] = read(tmp_path, document)
+    assert scene.default_rotation is None
+
+
+def broken(path: list[Any], value: Any) -> Any:
+    document = copy.deepcopy(DOCUMENT)
+    place = document
+    for step in path[:-1]:
+        place = place[step]
+    place[path[-1]] = value
+    return document
+
+
+NAN = float("nan")
+CASES = [
+    (["reachable_positions"], [], "Lab: no reachable position"),
+    (["reachable_positions"], None, "Lab: reachable_positions is not a list"),
+    (["reachable_positions", 1, "x"], NAN, r"Lab: reachable_positions\[1\]"),
+    (["reachable_positions", 0, "x"], 0.2, "Lab: reachable position x .*: off the 0.25 m grid"),
+    (["objects"], [], "Lab: no objects"),
+    (["objects"], {}, "Lab: objects is not a list"),
+    (["objects", 0], 3, "Lab: an object without objectType"),
+    (["objects", 0, "objectId"], "", "Lab: an object without objectId"),
+    (["objects", 0, "objectType"], None, "Lab: an object without objectType"),
+    (["objects", 0, "objectId"], "Desk|0", r"Lab: Desk\|0: id occurs 2 times"),
+    (["objects", 0, "axisAlignedBoundingBox"], None, r"Lab: Mug\|1: no axisAligned"),
+    (["objects", 0, "axisAlignedBoundingBox", "center", "y"], NAN, r"Lab: Mug\|1: center is not"),
+    (["objects", 0, "axisAlignedBoundingBox", "size", "y"], -1, r"Lab: Mug\|1: .*negative size"),
+    (["objects", 0, "axisAlignedBoundingBox", "size"], [1, 1, 1], r"Lab: Mug\|1: size is not"),
+    (["objects", 0, "objectOrientedBoundingBox"], {}, None),
+    (["objects", 0, "objectOrientedBoundingBox"], {"cornerPoints": [[0, 0, 0]]}, "8 finite"),
+    (["objects", 0, "parentReceptacles"], 3, r"Lab: Mug\|1: parentReceptacles"),
+    (["room_type"], "hall", "Lab: room_type 'hall'"),
+    (["name"], None, "a scene without a name"),
+    (["agent"], 3, "Lab: agent"),
+    (["agent", "position"], None, "Lab: agent"),
+    (["agent", "cameraHorizon"], "level", "Lab: agent"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "message"), CASES)
+def test_rules(tmp_path: Path, path: list[Any], value: Any, message: str | None) -> None:
+    if message is None:
+        assert read(tmp_path, broken(path, value))
+        return
+    with pytest.raises(SceneError, match=message) as error:
+        read(tmp_path, broken(path, value))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "[1]", "3", "null", "[" * 100_000])
+def test_files_that_hold_no_scene(tmp_path: Path, content: str) -> None:
+    with pytest.raises(SceneError, match=r"scenes\.json") as error:
+        read(tmp_path, content)
+    assert "\n" not in str(error.value)
+
+
+def test_a_name_taken_twice(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="Lab: name occurs 2 times"):
+        read(tmp_path, [DOCUMENT, DOCUMENT])
+
+
+def test_classes_need_word_vectors(tmp_path: Path) -> None:
+    document = broken(["objects", 0, "objectType"], "Xqzzy")
+    with pytest.raises(SceneError, match=r"Lab: Mug\|1: no word vector"):
+        metadata.check_classes(read(tmp_path, document))
+    metadata.check_classes(read(tmp_path, DOCUMENT))
+
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4)
+    ),
+    max_leaves=8,
+)
+places = st.sampled_from(
+    [
+        ["objects", 0, "axisAlignedBoundingBox"],
+        ["objects", 0, "axisAlignedBoundingBox", "size", "x"],
+        ["objects", 0, "objectOrientedBoundingBox"],
+        ["objects", 0, "rotation"],
+        ["objects", 0, "parentReceptacles"],
+        ["objects", 2],
+        ["reachable_positions"],
+        ["reachable_positions", 0],
+        ["agent"],
+        ["agent", "cameraHorizon"],
+        ["name"],
+        ["room_type"],
+    ]
+)
+
+
+@given(places, anything)
+def test_whatever_is_wrong_is_a_scene_error(path: list[Any], value: Any) -> None:
+    message = ""
+    try:
+        metadata._read_scene(Path("scenes.json"), broken(path, value))
+    except SceneError as error:
+        message = str(error)
+    assert "\n" not in message
