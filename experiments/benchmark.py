@@ -34,13 +34,15 @@ if TYPE_CHECKING:
     from tdanet_jax.task import Task
 
 Row = dict[str, Any]
+Part = Literal["tables", "machine", "environment", "update", "evaluation", "decision"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
     """Measures env, rollout, update, evaluation and one decision on this machine."""
 
-    parts: tuple[Literal["machine", "environment", "update", "evaluation", "decision"], ...] = (
+    parts: tuple[Part, ...] = (
+        "tables",
         "machine",
         "environment",
         "update",
@@ -84,16 +86,16 @@ def measure(command: Command) -> Iterator[Row]:
     from tdanet_jax import scenes, words
     from tdanet_jax.task import make_task
 
-    began = time.perf_counter()
-    tables = scenes.load_tables()
-    task = make_task(TrainConfig(), tables, words.load_bundled())
     yield {
         "part": "start",
         "device": str(jax.devices()[0]),
         "processor": processor(),
         "jax": jax.__version__,
-        "tables_seconds": round(time.perf_counter() - began, 2),
     }
+    if "tables" in command.parts:
+        yield tables_row()
+    tables = scenes.load_tables()
+    task = make_task(TrainConfig(), tables, words.load_bundled())
     peak = None
     if "machine" in command.parts:
         machine = machine_row(command.repeats)
@@ -134,6 +136,36 @@ def timed(call: Callable[[], Any], repeats: int, inner: int = 1) -> tuple[float,
     return first, statistics.median(taken)
 
 
+def tables_row() -> Row:
+    """From the bundled rooms to tables, to a file, and from the file; peak memory so far."""
+    import resource
+    import tempfile
+
+    from tdanet_jax.scenes import ithor
+    from tdanet_jax.scenes.tables import SceneTables, build
+
+    began = time.perf_counter()
+    tables = build(ithor.load_scenes())
+    built = time.perf_counter()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "tables.npz"
+        tables.save(path)
+        saved = time.perf_counter()
+        SceneTables.load(path)
+        loaded = time.perf_counter()
+        size = path.stat().st_size
+    return {
+        "part": "tables",
+        "rooms": len(tables.scenes),
+        "build_seconds": round(built - began, 2),
+        "save_seconds": round(saved - built, 2),
+        "load_seconds": round(loaded - saved, 2),
+        "peak_memory_gb": round(peak / 1e9, 2),
+        "file_mb": round(size / 1e6, 1),
+    }
+
+
 def machine_row(repeats: int) -> Row:
     """The machine's own limits: matrix products and memory."""
     import jax
@@ -170,24 +202,24 @@ def environment_row(task: Task, count: int, observed: bool, repeats: int) -> Row
     steps = 64
 
     @jax.jit
-    def play(key: jax.Array, params: env.EnvParams) -> jax.Array:
+    def play(key: jax.Array, params: env.EnvParams) -> tuple[jax.Array, env.Observation]:
         reset_key, key = jax.random.split(key)
         state = jax.vmap(env.reset_state, (0, None))(jax.random.split(reset_key, count), params)
 
-        def body(state: env.EnvState, key: jax.Array) -> tuple[env.EnvState, jax.Array]:
+        def body(carry: tuple, key: jax.Array) -> tuple[tuple, jax.Array]:
+            state, obs = carry
             action_key, step_key = jax.random.split(key)
             action = jax.random.randint(action_key, (count,), 0, NUM_ACTIONS, jnp.uint8)
             keys = jax.random.split(step_key, count)
-            obs, state, reward, *_ = jax.vmap(env.step, (0, 0, 0, None))(
+            following, state, reward, *_ = jax.vmap(env.step, (0, 0, 0, None))(
                 keys, state, action, params
             )
-            total = reward.sum()
-            if observed:
-                total += obs.boxes.sum() + obs.classes.sum() + obs.mask.sum()
-            return state, total
+            return (state, following if observed else obs), reward.sum()
 
-        _, totals = jax.lax.scan(body, state, jax.random.split(key, steps))
-        return totals.sum()
+        # What is carried is written in every step, and returned, so that it cannot be left out.
+        obs = jax.vmap(env.observe, (0, None))(state, params)
+        (_, obs), rewards = jax.lax.scan(body, (state, obs), jax.random.split(key, steps))
+        return rewards.sum(), obs
 
     first, seconds = timed(lambda: play(jax.random.key(0), task.train_params), repeats)
     return {
