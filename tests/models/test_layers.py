@@ -51,7 +51,7 @@ class Stack(nn.Module):
 
     @nn.compact
     def __call__(self, carry: Any, x: jax.Array, fresh: jax.Array) -> Any:
-        x, aside = nn.relu(Linear(6, self.dtype)(x)), x[..., 1:]
+        x, aside = nn.relu(Linear(8, self.dtype)(x)), x[..., 1:]
         carry, hidden = LSTM(H, self.dtype)(carry, x, aside, fresh)
         return carry, Linear(2, self.dtype)(hidden)
 
@@ -82,7 +82,7 @@ def recorded(
 def test_the_lstm_is_the_numpy_lstm(seed: int, fresh_share: float) -> None:
     params, carry, _, fresh = example(seed, fresh_share)
     weights = params["LSTM_0"]
-    x, aside = normal(T, B, 6, seed=seed), normal(T, B, N - 1, seed=seed + 1)
+    x, aside = normal(T, B, 8, seed=seed), normal(T, B, N - 1, seed=seed + 1)
     (h, c), out = LSTM(H).apply({"params": weights}, carry, x, aside, fresh)
     given = (np.asarray(a) for a in (*carry, x, aside, fresh))
     expected, (last_h, last_c) = equations.lstm_rollout(np, equations.in_float64(weights), *given)

@@ -1,0 +1,157 @@
+"""Do the tests notice? One fault at a time is put into a copy of the package, and they must fail.
+
+Slow: `pytest -m slow tests/test_mutation.py`.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+class Fault(NamedTuple):
+    """A change of one place of the source, and the tests that must notice."""
+
+    name: str
+    module: str  # path below tdanet_jax/
+    right: str
+    wrong: str
+    tests: str  # paths below tests/
+
+
+ENV, LEARNER, TDANET = "env.py", "learner.py", "models/tdanet.py"
+TEST_TDANET = "models/test_tdanet.py"
+FAULTS = (
+    Fault("rotation sign", ENV, "Action.ROTATE_RIGHT, 1, 0", "Action.ROTATE_RIGHT, -1, 0",
+          "test_env.py"),
+    Fault("impossible look", ENV, "Action.LOOK_UP, 0, horizon",
+          "Action.LOOK_UP, 1 - horizon, horizon", "test_env.py"),
+    Fault("L without Done", ENV, "astype(jnp.int32) + 1\n", "astype(jnp.int32)\n", "test_env.py"),
+    Fault("parent paid twice", ENV, "in_view & ((state.parents_seen & bits) == 0)", "in_view",
+          "test_reward.py"),
+    Fault("failed Done pays a parent", ENV, "~done & jnp.any(fresh)", "jnp.any(fresh)",
+          "test_reward.py"),
+    Fault("Done pays new parents only", ENV, "DONE_REWARD + largest(in_view)",
+          "DONE_REWARD + largest(fresh)", "test_reward.py"),
+    Fault("time-outs terminate", ENV, "terminated=done", "terminated=done | (steps >= limit)",
+          "test_env.py"),
+    Fault("a step too many", ENV, "steps >= limit", "steps > limit", "test_env.py"),
+    Fault("first padding row is valid", ENV, "slots < last - first", "slots <= last - first",
+          "test_env.py"),
+    Fault("always the same rotation", ENV, "(bits[0] & 7)", "(bits[0] & 1)", "test_env.py"),
+    Fault("starts that cannot reach", ENV, "valid = positions[reachable[positions, goal]]",
+          "valid = positions", "test_env.py"),
+    Fault("centre of the extent", ENV, "np.add.reduceat(centre, first) / members", "centre[first]",
+          "test_env.py"),
+    Fault("share of all rooms", "reward.py", "gaps = gaps[np.isfinite(gaps)]",
+          "gaps = gaps[: support]", "test_reward.py"),
+    Fault("parents from all rooms", "task.py", "find_parents(seen_rooms", "find_parents(tables",
+          "test_zero_shot.py"),
+    Fault("hidden detections leak", "task.py",
+          "zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)",
+          "tables.subset(split.train_scenes)", "test_zero_shot.py"),
+    Fault("hidden words leak", "task.py",
+          "zero_shot.hide_words(words, tables.classes, split.hidden)", "words",
+          "test_zero_shot.py"),
+    Fault("hidden distances leak", "zero_shot.py", "target in hidden for target",
+          "False for target", "test_zero_shot.py"),
+    Fault("hidden visibility leaks", "zero_shot.py", "row_visible=tables.row_visible[keep_row]",
+          "row_visible=tables.row_visible[: keep_row.sum()]", "test_zero_shot.py"),
+    Fault("mask dropped", TDANET, "nn.softmax(logits, axis=-1, where=mask)",
+          "nn.softmax(logits, axis=-1)", TEST_TDANET),
+    Fault("empty frame has a word", TDANET, "jnp.where(obs.mask, weights, 0.0)", "weights",
+          TEST_TDANET),
+    Fault("difference without its absolute", TDANET, "jnp.abs(features - table",
+          "(features - table", TEST_TDANET),
+    Fault("boxes without attention", TDANET, "weights, obs.boxes)", "1.0 * obs.mask, obs.boxes)",
+          TEST_TDANET),
+    Fault("dropout without scale", TDANET, "features / (1 - self.dropout)", "features",
+          TEST_TDANET),
+    Fault("gates swapped", "models/layers.py", "f * cell + i * g", "i * cell + f * g",
+          "models/test_layers.py"),
+    Fault("no gradient through the cell", "models/layers.py", "grad_cell * f), fresh_t",
+          "0 * grad_cell), fresh_t", "models/test_layers.py"),
+    Fault("gradient across episodes", "models/layers.py", "keep = ~fresh[..., None]",
+          "keep = fresh[..., None] | True", "models/test_layers.py"),
+    Fault("time-outs not bootstrapped", LEARNER, "ended=over,", "ended=over | truncated,",
+          "test_learner.py"),
+    Fault("held steps counted", LEARNER, "counted = ~steps.held", "counted = steps.held | True",
+          "test_learner.py"),
+    Fault("carry of the last episode", LEARNER, "fresh=over,", "fresh=jnp.zeros_like(over),",
+          "test_learner.py"),
+    Fault("no value behind the rollout", LEARNER, "return after, steps, out.value",
+          "return after, steps, 0 * out.value", "test_learner.py"),
+    Fault("infinite updates applied", LEARNER, "jnp.where(finite, new, old)", "new",
+          "test_learner.py"),
+    Fault("the same episodes again", LEARNER, "fold_in(state.key, state.updates)",
+          "fold_in(state.key, 0)", "test_learner.py"),
+    Fault("entropy penalised", LEARNER, "- entropy_weight * entropy", "+ entropy_weight * entropy",
+          "test_learner.py"),
+    Fault("value over the episode's end", "returns.py", "gamma * (1.0 - ended)",
+          "gamma * (1.0 - held)", "test_returns.py"),
+    Fault("held advantage", "returns.py", "jnp.where(held_t, 0.0, delta_t",
+          "jnp.where(False, 0.0, delta_t", "test_returns.py"),
+    Fault("network forgets its actions", "policies.py", "(table, carry, probs,",
+          "(table, carry, previous,", "test_evaluation.py"),
+    Fault("network forgets", "policies.py", "jnp.zeros_like(fresh)), action", "fresh), action",
+          "test_evaluation.py"),
+    Fault("success after the end", "evaluation.py", "success | (alive & out.success)",
+          "success | out.success", "test_evaluation.py"),
+    Fault("bootstrap of episodes", "metrics.py",
+          "_, member = np.unique(cluster, return_inverse=True)", "member = np.arange(len(cluster))", "test_metrics.py"),
+    Fault("L of five left out", "metrics.py", "shortest >= least", "shortest > least",
+          "test_metrics.py"),
+    Fault("SPL without L", "metrics.py", "success * shortest /", "success /", "test_metrics.py"),
+    Fault("raw means", "words.py", "norm * mean / np.linalg.norm(mean)", "norm * mean",
+          "test_words.py"),
+    Fault("starts drawn anywhere", "episodes.py", "valid = positions[reachable[positions, goal]]",
+          "valid = positions", "test_episodes.py"),
+)  # fmt: skip
+
+
+def passes(root: Path, tests: str) -> bool:
+    """Whether the tests pass in a copy of the repository."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run(
+        [*command, *(f"tests/{name}" for name in tests.split())],
+        cwd=root, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode in (0, 1), done.stdout + done.stderr  # neither passed nor failed
+    return done.returncode == 0
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the repository; the tests in it see its own package."""
+    root = tmp_path_factory.mktemp("copy")
+    for name in ("tdanet_jax", "tests", "experiments", "assets"):
+        shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", root)
+    return root
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_each_fault_is_noticed(copy: Path, fault: Fault) -> None:
+    path = copy / "tdanet_jax" / fault.module
+    source = path.read_text()
+    assert source.count(fault.right) >= 1, "the source has changed: write the fault anew"
+    path.write_text(source.replace(fault.right, fault.wrong))
+    try:
+        assert not passes(copy, fault.tests)
+    finally:
+        path.write_text(source)
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_each_fault_still_has_its_place(fault: Fault) -> None:
+    assert fault.right in (ROOT / "tdanet_jax" / fault.module).read_text()
