@@ -130,8 +130,8 @@ def box_line(rooms: list[Scene], count: int, views: int) -> str:
         classes += case
     return (
         f"Boxes against a ray for every 2 x 2 pixels on the same solids, {count * views} views: "
-        f"mean IoU {np.mean(overlaps):.3f} over {len(overlaps)} objects above 0.5 % of the image; classes "
-        f"in view: precision {classes.precision:.3f}, recall {classes.recall:.3f} "
+        f"mean IoU {np.mean(overlaps):.3f} over {len(overlaps)} objects above 0.5 % of the image; "
+        f"classes in view: precision {classes.precision:.3f}, recall {classes.recall:.3f} "
         "(sampling error, not fidelity to AI2-THOR)"
     )
 
