@@ -15,16 +15,14 @@ import functools
 import json
 import platform
 import statistics
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import tyro
 from rich.table import Table
 
-from experiments.console import console, fail, one_line_errors
+from experiments.console import console, fail, one_line_errors, parse
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 
 if TYPE_CHECKING:
@@ -64,7 +62,7 @@ class Command:
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
-    command = tyro.cli(Command, args=sys.argv[1:] if arguments is None else arguments)
+    command = parse(Command, arguments, prog="benchmark")
     with one_line_errors():
         if command.out is not None and command.out.exists():
             fail(f"--out {command.out}: exists")

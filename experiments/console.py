@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import itertools
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NoReturn, TypeVar
 
+import tyro
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -20,13 +23,28 @@ from rich.progress import (
 )
 from rich.text import Text
 
+Arguments = TypeVar("Arguments")
+
 console = Console(stderr=False, highlight=False, soft_wrap=True)
 
 
-def fail(message: object) -> None:
+def fail(message: object) -> NoReturn:
     """Ends the program with one line on standard error and exit status 2."""
     print(f"error: {message}", file=sys.stderr)
     raise SystemExit(2)
+
+
+def parse(command: type[Arguments], arguments: Sequence[str] | None, **options: Any) -> Arguments:
+    """`tyro.cli`, its boxed errors brought to one line: the first paragraph, and the suggestion."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(command, args=arguments, **options)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        lines = [line.strip("│ ") for line in said.getvalue().splitlines()[1:]]
+        fail(" ".join(itertools.takewhile(lambda line: not line.startswith("─"), lines)))
 
 
 @contextlib.contextmanager

@@ -9,13 +9,10 @@ Writes results.json, results.md and episodes.jsonl into --out (by default <check
 from __future__ import annotations
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import Literal
 
-import tyro
-
-from experiments.console import console, fail, one_line_errors, print_summary
+from experiments.console import console, fail, one_line_errors, parse, print_summary
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
 
@@ -39,7 +36,7 @@ class Command:
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
-    command = tyro.cli(Command, args=sys.argv[1:] if arguments is None else arguments)
+    command = parse(Command, arguments, prog="evaluate")
     with one_line_errors():
         trained = command.policy in ("sample", "greedy")
         if trained and command.checkpoint is None:

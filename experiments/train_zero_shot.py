@@ -24,6 +24,7 @@ from experiments.console import (
     console,
     fail,
     one_line_errors,
+    parse,
     print_summary,
     reporter,
 )
@@ -49,21 +50,21 @@ class Command:
     """Also write TensorBoard events (needs tensorboardX)."""
 
 
-def parse(arguments: list[str]) -> Command:
+def parse_command(arguments: list[str]) -> Command:
     """The command line; `--preset` chooses the defaults of the flags beside it."""
     preset = "default"
     for i, word in enumerate(arguments):
         if word.startswith("--preset"):
             preset = word.partition("=")[2] or "".join(arguments[i + 1 : i + 2])
     default = Command(run=PRESETS.get(preset, PRESETS["default"]))
-    return tyro.cli(Command, args=arguments, default=default, prog="train_zero_shot")
+    return parse(Command, arguments, default=default, prog="train_zero_shot")
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     words = sys.argv[1:] if arguments is None else arguments
     with one_line_errors():
-        command = parse(words)
+        command = parse_command(words)
         if command.resume is not None:
             if len(words) > 2:
                 fail("--resume goes on to the original budget and takes no other flag")
