@@ -57,12 +57,19 @@ def one_line_errors() -> Iterator[None]:
 
 
 class StopRequest:
-    """Remembers the first SIGTERM or Ctrl-C; a second Ctrl-C interrupts as usual."""
+    """Remembers the first SIGTERM or Ctrl-C inside its `with` block; a second one interrupts."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
-        signal.signal(signal.SIGTERM, self._remember)
-        signal.signal(signal.SIGINT, self._remember)
+
+    def __enter__(self) -> StopRequest:
+        signals = (signal.SIGTERM, signal.SIGINT)
+        self._before = {number: signal.signal(number, self._remember) for number in signals}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     def _remember(self, number: int, frame: Any) -> None:
         if self.signal is not None:
@@ -77,8 +84,8 @@ class _Figures(ProgressColumn):
         return Text(str(task.fields.get("figures", "")))
 
 
-def progress_bar() -> Progress:
-    """A bar with share done, figures, time spent and time left."""
+def progress_bar(transient: bool) -> Progress:
+    """A bar with share done, figures, time spent and time left; a transient one leaves no trace."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),
@@ -88,19 +95,23 @@ def progress_bar() -> Progress:
         TextColumn("left"),
         TimeRemainingColumn(),
         console=console,
+        transient=transient,
     )
 
 
 @contextlib.contextmanager
-def reporter(title: str, every: int = 1) -> Iterator[Callable[[float, str], None]]:
+def reporter(
+    title: str, every: int = 1, transient: bool = False
+) -> Iterator[Callable[[float, str], None]]:
     """Shows progress: `report(share, figures)`, a live bar on a terminal, else a line now and then.
 
     Args:
       title: what is going on.
       every: without a terminal, print only every so many reports.
+      transient: on a terminal, take the bar away at the end.
     """
     if console.is_terminal:
-        with progress_bar() as bar:
+        with progress_bar(transient) as bar:
             task = bar.add_task(title, total=1.0, figures="")
 
             def live(share: float, figures: str) -> None:

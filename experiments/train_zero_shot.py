@@ -91,8 +91,7 @@ def train(config: TrainConfig, folder: Path, tensorboard: bool) -> None:
     from tdanet_jax.task import make_task, resolve_precision
     from tdanet_jax.training import Run, read_metrics
 
-    stop = StopRequest()
-    with reporter("rooms", every=30) as report_rooms:
+    with reporter("rooms", every=30, transient=True) as report_rooms:
         tables = scenes.load_tables(lambda done, total: report_rooms(done / total, "rebuilt"))
     task = make_task(config, tables, words.load_bundled())
     lists = episodes.load(tables, task.split)
@@ -104,7 +103,11 @@ def train(config: TrainConfig, folder: Path, tensorboard: bool) -> None:
     console.print(f"{config.model}, split {task.split.name}, seed {config.seed} -> {folder}")
     console.print("compiling ...")
     saved = run.seconds
-    with reporter("training", every=10) as show, metrics_sink(folder, tensorboard) as sink:
+    with (
+        StopRequest() as stop,
+        reporter("training", every=10) as show,
+        metrics_sink(folder, tensorboard) as sink,
+    ):
         for row in run.chunks():
             show(
                 run.progress,

@@ -58,8 +58,9 @@ class NetworkConfig:
     """Units of every layer of the encoder."""
     hidden: int = 512
     """Units of the LSTM."""
-    dropout: float = 0.25
-    """Share of the Siamese difference that is dropped in training."""
+    dropout: float = 0.0
+    """Share of the Siamese difference that is dropped in training. The paper's is 0.25; on
+    validation it changed nothing but the speed."""
     rows: Literal["class", "object"] = "class"
     """One detection per class (extent over its instances) or per object, as in the paper."""
     word_norm: float = 3.0
