@@ -36,10 +36,14 @@ class Solids:
     aligned: int  # how many of the K lie along the world's axes
 
 
+# One array [N] for each axis: XLA vectorises these loops only without an axis of length three.
+Vectors = tuple[jax.Array, jax.Array, jax.Array]
+
+
 def blocked_by_box(
-    camera: jax.Array, ray: jax.Array, lo: jax.Array, hi: jax.Array, kind: jax.Array
+    camera: Vectors, ray: Vectors, lo: jax.Array, hi: jax.Array, kind: jax.Array
 ) -> jax.Array:
-    """Whether a box hides the ends of the segments from `camera` [3, N] along `ray` [3, N]: [N].
+    """Whether a box hides the ends of the segments from `camera` along `ray`: [N] bool.
 
     A segment meets the open box where, for every pair of axes, it enters along one before it
     leaves along the other. It is blocked if it passes through or ends inside a closed box.
@@ -48,37 +52,44 @@ def blocked_by_box(
     Args:
         lo, hi: [3] corners of the box. kind: scalar. All int32, below 2^15 in size.
     """
-    sign = jnp.where(ray < 0, -1, 1)
-    step = ray * sign
-    one, other = (lo[:, None] - camera) * sign, (hi[:, None] - camera) * sign
-    enter, leave = jnp.minimum(one, other), jnp.maximum(one, other)
-    hit = (leave > 0).all(axis=0) & (enter < step).all(axis=0)
+    step = [jnp.abs(ray[a]) for a in range(3)]
+    ahead = [ray[a] >= 0 for a in range(3)]
+    enter = [jnp.where(ahead[a], lo[a] - camera[a], camera[a] - hi[a]) for a in range(3)]
+    leave = [jnp.where(ahead[a], hi[a] - camera[a], camera[a] - lo[a]) for a in range(3)]
+    hit, through = jnp.bool_(True), jnp.bool_(False)
+    for a in range(3):
+        hit &= (leave[a] > 0) & (enter[a] < step[a])
+        through |= leave[a] < step[a]
     for i, j in ((0, 1), (1, 2), (2, 0)):
         overlap = enter[i] * step[j] < leave[j] * step[i]
         overlap &= enter[j] * step[i] < leave[i] * step[j]
         hit &= overlap | ((step[i] | step[j]) == 0)  # along the third axis: nothing to compare
-    through = (leave < step).any(axis=0)
     return hit & (through | (kind == CLOSED))
 
 
-def _turned(matrix: jax.Array, point: jax.Array) -> jax.Array:
-    """`point` [3, N] in the frame of `matrix` [3, 3] (times 2^14), rounded to millimetres."""
-    total = (matrix[:, :, None] * point[None]).sum(axis=1)
-    return (total + (1 << (TURN_BITS - 1))) >> TURN_BITS
+def _turned(matrix: jax.Array, point: Vectors, origin: jax.Array) -> Vectors:
+    """`point` in the frame of `matrix` [3, 3] (times 2^14) around `origin`, in millimetres."""
+    x, y, z = (point[a] - origin[a] for a in range(3))
+    half = 1 << (TURN_BITS - 1)
+    a, b, c = ((m[0] * x + m[1] * y + m[2] * z + half) >> TURN_BITS for m in matrix)
+    return a, b, c
+
+
+def _minus(end: Vectors, start: Vectors) -> Vectors:
+    return end[0] - start[0], end[1] - start[1], end[2] - start[2]
 
 
 @cache
 def _compiled() -> Any:
     def cast(camera, point, lo, hi, kind, origin, turn, aligned, count):  # type: ignore[no-untyped-def]
-        ray = point - camera
+        start, end = tuple(camera), tuple(point)
 
         def straight(k: jax.Array, blocked: jax.Array) -> jax.Array:
-            return blocked | blocked_by_box(camera, ray, lo[k], hi[k], kind[k])
+            return blocked | blocked_by_box(start, _minus(end, start), lo[k], hi[k], kind[k])
 
         def turned(k: jax.Array, blocked: jax.Array) -> jax.Array:
-            start = _turned(turn[k], camera - origin[k][:, None])
-            end = _turned(turn[k], point - origin[k][:, None])
-            return blocked | blocked_by_box(start, end - start, lo[k], hi[k], kind[k])
+            near, far = (_turned(turn[k], at, origin[k]) for at in (start, end))
+            return blocked | blocked_by_box(near, _minus(far, near), lo[k], hi[k], kind[k])
 
         blocked = jnp.zeros(camera.shape[1], bool)
         blocked = jax.lax.fori_loop(0, aligned, straight, blocked)

@@ -139,6 +139,7 @@ def _boxes_in_view(
     center, corner, eye = (a.astype(np.float32) for a in (patches.center, patches.corner, cameras))
     x, up, z = (center[patch, axis] - eye[position, axis] for axis in range(3))
     corners, eyes = turned(corner[..., 0], corner[..., 2]), turned(eye[:, 0], eye[:, 2])
+    corners_up, eyes_up = np.ascontiguousarray(corner[..., 1]), np.ascontiguousarray(eye[:, 1])
     parts = [_nothing()]
     for heading, (right, ahead) in enumerate(turned(x, z)):
         for horizon in range(HORIZONS):
@@ -151,7 +152,7 @@ def _boxes_in_view(
                 np.take(table, patch[rows], axis=0) - np.take(at, position[rows])[:, None]
                 for table, at in (
                     (corners[heading][0], eyes[heading][0]),
-                    (corner[..., 1], eye[:, 1]),
+                    (corners_up, eyes_up),
                     (corners[heading][1], eyes[heading][1]),
                 )
             )
