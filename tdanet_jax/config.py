@@ -19,11 +19,11 @@ CONFIG_FILE = "config.json"
 class LearnerConfig:
     """The update's constants. The reference's own are those of `--preset paper`."""
 
-    num_envs: int = 512
+    num_envs: int = 256
     """Environments that step together (B)."""
     rollout_steps: int = 20
     """Actions per environment and update (T)."""
-    learning_rate: float = 6e-4
+    learning_rate: float = 5e-4
     """Adam's step size at the start."""
     final_learning_rate: float = 0.0
     """Adam's step size at the end of the budget; falls linearly."""
