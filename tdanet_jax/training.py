@@ -130,6 +130,7 @@ class Run:
             "length": float(metrics["length_sum"].sum()) * per_episode,
             "reward": float(metrics["reward_sum"].sum()) / steps,
             **mean,
+            "held_steps": int(metrics["held_steps"].sum()),
             "skipped": int(self.state.skipped),
             "seconds": round(self.seconds, 3),
             "steps_per_second": round(steps / took, 1),

@@ -246,8 +246,7 @@ def test_the_last_rows_of_the_table_are_observed_whole(some_rooms: SceneTables) 
 @pytest.mark.parametrize("merge", [False, True])
 def test_no_detection_is_dropped_for_lack_of_room(some_rooms: SceneTables, merge: bool) -> None:
     params = env.make_params(some_rooms, TARGETS, no_parents(some_rooms), STEP_LIMITS, merge)
-    rows = some_rooms.merged().start if merge else some_rooms.row_start
-    fullest = np.diff(rows).argmax().astype(np.int32)
+    fullest = np.diff(params.row_start).argmax().astype(np.int32)
     zero = jnp.int32(0)
     obs = env.observe(EnvState(jnp.int32(fullest), zero, zero, zero, zero), params)
     assert obs.mask.all()

@@ -89,17 +89,6 @@ class SceneTables:
         octets = np.packbits(visible, axis=1, bitorder="little")
         return octets.view("<u4").astype(np.uint32)
 
-    def merged(self) -> "MergedRows":
-        """One row per class and state: the extent over all of the class's instances."""
-        key = self.row_state.astype(np.int64) * len(self.classes) + self.row_class
-        first = np.flatnonzero(np.diff(key, prepend=-1))
-        box = np.empty((len(first), 4), np.int16)
-        if len(first):
-            box[:, :2] = np.minimum.reduceat(self.row_box[:, :2], first)
-            box[:, 2:] = np.maximum.reduceat(self.row_box[:, 2:], first)
-        counts = np.bincount(self.row_state[first], minlength=self.num_states)
-        return MergedRows(_ends(counts), self.row_class[first], box)
-
     @cached_property
     def data_version(self) -> str:
         """First 12 hex digits of the sha256 over the content of all fields."""
@@ -172,15 +161,6 @@ class SceneTables:
             k: tuple(v) if isinstance(v, list) else v for k, v in rest.items()
         }
         return cls(**arrays, **fields)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class MergedRows:
-    """Detection rows in which a class's instances in a state are one; M of them."""
-
-    start: np.ndarray  # [S + 1] int32
-    object_class: np.ndarray  # [M] int16
-    box: np.ndarray  # [M, 4] int16
 
 
 def _ends(counts: np.ndarray) -> np.ndarray:

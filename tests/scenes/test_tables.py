@@ -91,18 +91,6 @@ def test_visible_bits_by_hand(rooms: SceneTables) -> None:
         assert got == want
 
 
-def test_merged_rows_by_hand(rooms: SceneTables) -> None:
-    merged = rooms.merged()
-    for state in range(0, rooms.num_states, 5):
-        rows = np.arange(rooms.row_start[state], rooms.row_start[state + 1])
-        some = slice(merged.start[state], merged.start[state + 1])
-        labels = sorted(set(rooms.row_class[rows].tolist()))
-        assert merged.object_class[some].tolist() == labels
-        for label, box in zip(labels, merged.box[some], strict=True):
-            parts = rooms.row_box[rows[rooms.row_class[rows] == label]]
-            assert box.tolist() == [*parts[:, :2].min(axis=0), *parts[:, 2:].max(axis=0)]
-
-
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=5)
 def test_a_subset_is_what_its_rooms_alone_would_give(seed: int) -> None:
@@ -165,4 +153,3 @@ def test_a_room_in_which_nothing_is_seen() -> None:
     assert len(t.row_object) == 0
     assert (t.distance == -1).all()
     assert not t.visible_bits().any()
-    assert len(t.merged().box) == 0
