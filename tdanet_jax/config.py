@@ -79,7 +79,7 @@ class TrainConfig:
     """Seen/unseen target classes: 22/0, 18/4 or 14/8."""
     model: str = "tdanet"
     """The model to train: tdanet."""
-    steps: int = 15_000_000
+    steps: int = 12_000_000
     """Budget in environment steps (actions)."""
     episodes: int | None = None
     """Stop after this many training episodes instead; the paper's budget is 6,000,000."""

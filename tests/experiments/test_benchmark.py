@@ -1,0 +1,48 @@
+"""The benchmark command: its figures' names, its count of operations, and wrong arguments."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from experiments import benchmark
+from tdanet_jax.config import NetworkConfig
+from tdanet_jax.task import make_model
+
+
+def test_it_writes_one_json_object_per_figure(ithor, tmp_path):
+    out = tmp_path / "figures.jsonl"
+    benchmark.main(
+        ["--parts", "environment", "--environments", "8", "--repeats", "1", "--out", str(out)]
+    )
+    rows = [json.loads(line) for line in out.read_text().splitlines()]
+    assert [row["part"] for row in rows] == ["start", "environment", "environment"]
+    assert [row.get("observations") for row in rows] == [None, False, True]
+    assert all(row["steps_per_second"] > 0 for row in rows[1:])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--repeats", "0"], "--repeats 0: must be positive"),
+        (["--parts", "everything"], "invalid choice 'everything'"),
+        (["--out", "{folder}"], "exists"),
+    ],
+)
+def test_wrong_arguments_give_one_line(tmp_path, capsys, arguments, message):
+    with pytest.raises(SystemExit) as stopped:
+        benchmark.main([word.format(folder=tmp_path) for word in arguments])
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2
+    assert message in said
+    assert len(said.strip().splitlines()) == 1
+
+
+def test_the_hand_formula_counts_the_kernels_that_a_step_uses():
+    """All kernels but W_L's, which is used once per update for the table of classes."""
+    model = make_model(NetworkConfig(width=32, hidden=48, precision="float32"))
+    weights = model.initialise(jax.random.key(0), jnp.ones((5, 50)))
+    del weights["encoder"]["attention"]
+    kernels = sum(leaf.size for leaf in jax.tree.leaves(weights) if leaf.ndim == 2)
+    assert benchmark.forward_macs(model, 50) == kernels
