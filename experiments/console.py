@@ -34,17 +34,24 @@ def fail(message: object) -> NoReturn:
     raise SystemExit(2)
 
 
-def parse(command: type[Arguments], arguments: Sequence[str] | None, **options: Any) -> Arguments:
-    """`tyro.cli`, its boxed errors brought to one line: the first paragraph, and the suggestion."""
+@contextlib.contextmanager
+def one_line_usage() -> Iterator[None]:
+    """Brings the boxes that tyro prints about wrong arguments to their first paragraph, one line."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(command, args=arguments, **options)
+            yield
     except SystemExit as stop:
         if not stop.code:
             raise
         lines = [line.strip("│ ") for line in said.getvalue().splitlines()[1:]]
         fail(" ".join(itertools.takewhile(lambda line: not line.startswith("─"), lines)))
+
+
+def parse(command: type[Arguments], arguments: Sequence[str] | None, **options: Any) -> Arguments:
+    """`tyro.cli`, with errors in one line."""
+    with one_line_usage():
+        return tyro.cli(command, args=arguments, **options)
 
 
 @contextlib.contextmanager

@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tyro
 
-from experiments.console import console, fail, one_line_errors, reporter
+from experiments.console import console, fail, one_line_errors, one_line_usage, reporter
 from tdanet_jax.scenes.scene import GRID
 from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TRAIN_SCENES_PER_TYPE
 
@@ -271,12 +270,10 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
-        command = tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            args=sys.argv[1:] if arguments is None else arguments,
-            prog="scenes",
-            description=__doc__,
-        )
+        with one_line_usage():
+            command = tyro.extras.subcommand_cli_from_dict(
+                COMMANDS, args=arguments, prog="scenes", description=__doc__
+            )
         command.run()
 
 
