@@ -36,7 +36,7 @@ def fail(message: object) -> NoReturn:
 
 @contextlib.contextmanager
 def one_line_usage() -> Iterator[None]:
-    """Brings the boxes that tyro prints about wrong arguments to their first paragraph, one line."""
+    """Brings the box that tyro prints about wrong arguments to its first paragraph, in one line."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):

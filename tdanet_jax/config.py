@@ -94,6 +94,8 @@ class TrainConfig:
     """Updates in one compiled call, between two looks at the progress."""
     checkpoint_minutes: float = 2.0
     """Time between two checkpoints."""
+    max_skipped: int = 20
+    """Stop after this many updates that were skipped for a loss or gradient that is not finite."""
     learner: LearnerConfig = dataclasses.field(default_factory=LearnerConfig)
     """The update."""
     network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
@@ -111,6 +113,7 @@ class TrainConfig:
             "--minutes": self.minutes,
             "--chunk-updates": self.chunk_updates,
             "--checkpoint-minutes": self.checkpoint_minutes,
+            "--max-skipped": self.max_skipped,
             "--num-envs": self.learner.num_envs,
             "--rollout-steps": self.learner.rollout_steps,
             "--step-limit": self.learner.step_limit,

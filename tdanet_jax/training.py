@@ -87,6 +87,9 @@ class Run:
 
         Compilation is not counted as training time. Stop iterating to stop training; `save` then
         keeps what is done.
+
+        Raises:
+          ValueError: too many updates were skipped; the state is saved first.
         """
         self._drop_rows_after(int(self.state.updates))
         chunk = self._compile()
@@ -108,6 +111,12 @@ class Run:
             with (self.folder / METRICS_FILE).open("a") as file:
                 file.write(json.dumps(row) + "\n")
             yield row
+            if row["skipped"] >= self.config.max_skipped:
+                self.save()
+                raise ValueError(
+                    f"{self.folder}: {row['skipped']} updates skipped because the loss or gradient "
+                    "was not finite; the state is saved there"
+                )
 
     def _compile(self) -> jax.stages.Compiled:
         task, config = self.task, self.config

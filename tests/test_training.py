@@ -88,6 +88,17 @@ def test_the_budget_in_episodes_ends_the_run(task, tmp_path):
     assert run.steps < 640
 
 
+def test_a_run_that_is_no_longer_finite_stops_with_its_state_saved(task, tmp_path):
+    run = Run(tmp_path, dataclasses.replace(TINY, max_skipped=4), task)
+    broken = jax.tree.map(lambda leaf: leaf * np.nan, run.state.params)
+    run.state = run.state.replace(params=broken)
+    with pytest.raises(ValueError, match="4 updates skipped") as caught:
+        list(run.chunks())
+    assert "\n" not in str(caught.value)
+    assert run.steps == 160  # two chunks of two updates, all skipped
+    assert Run(tmp_path, TINY, task).steps == 160
+
+
 def test_a_damaged_checkpoint_is_one_clear_line(whole, task, tmp_path):
     run = Run(tmp_path, TINY, task)
     next(run.chunks())
