@@ -55,16 +55,26 @@ class Checkpoints:
         Raises:
           ValueError: there is no checkpoint, or it does not fit this configuration.
         """
+        state, meta = self._read(jax.eval_shape(_plain, jax.eval_shape(make_state)))
+        return state.replace(key=jax.random.wrap_key_data(state.key)), meta
+
+    def weights(self) -> Any:
+        """The parameters of the newest checkpoint, without knowing anything else of the run.
+
+        Raises:
+          ValueError: there is no checkpoint, or it cannot be read.
+        """
+        return self._read(None)[0]["params"]
+
+    def _read(self, shapes: Any) -> tuple[Any, dict[str, Any]]:
         latest = self.latest()
         if latest is None:
             raise ValueError(f"{self._manager.directory}: no checkpoint")
-        shapes = jax.eval_shape(make_state)
         try:
             restored = self._manager.restore(
                 latest,
                 args=ocp.args.Composite(
-                    state=ocp.args.StandardRestore(jax.eval_shape(_plain, shapes)),
-                    meta=ocp.args.JsonRestore(),
+                    state=ocp.args.StandardRestore(shapes), meta=ocp.args.JsonRestore()
                 ),
             )
         except Exception as error:  # Orbax raises many kinds for a damaged folder
@@ -72,9 +82,7 @@ class Checkpoints:
             raise ValueError(
                 f"{self._manager.directory / str(latest)}: unreadable checkpoint ({reason})"
             ) from error
-        state = restored["state"]
-        state = state.replace(key=jax.random.wrap_key_data(state.key))
-        return state, dict(restored["meta"])
+        return restored["state"], dict(restored["meta"])
 
     def close(self) -> None:
         """Waits for what is being written."""

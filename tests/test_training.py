@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tdanet_jax import words
+from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.task import make_task
 from tdanet_jax.training import Run, read_metrics
@@ -67,6 +68,15 @@ def test_a_stopped_run_goes_on_bit_for_bit(whole, task, tmp_path):
     for ours, theirs in zip(leaves(again.state), leaves(whole[1].state), strict=True):
         np.testing.assert_array_equal(ours, theirs)
     assert without_times(read_metrics(tmp_path)) == without_times(whole[2])
+
+
+def test_the_weights_of_a_run_are_read_alone(whole):
+    folder, run, _ = whole
+    weights = Checkpoints(folder).weights()
+    for ours, theirs in zip(
+        jax.tree.leaves(weights), jax.tree.leaves(run.state.params), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
 
 
 def test_a_finished_run_has_nothing_left_to_do(whole, task):

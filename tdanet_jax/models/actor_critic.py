@@ -70,6 +70,11 @@ class ActorCritic(nn.Module):
         carry, hidden = self.lstm(carry, features, action, fresh)
         return carry, Output(self.actor(hidden), self.critic(hidden)[..., 0])
 
+    def attention(self, table: Any, obs: Observation) -> jax.Array:
+        """The encoder's weights over the detections, [..., K]."""
+        weights: jax.Array = self.encoder.attend(table, obs)
+        return weights
+
     def initial_carry(self, batch: int) -> Carry:
         """The recurrent state at the start of an episode: zeros."""
         return jnp.zeros((batch, self.hidden)), jnp.zeros((batch, self.hidden))

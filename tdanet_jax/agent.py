@@ -1,0 +1,165 @@
+"""A trained agent on its own: detections of any detector in, an action out.
+
+agent = tdanet_jax.load("runs/my-run")
+memory = agent.start()
+memory, decision = agent.act(memory, [Detection("mug", 0.2, 0.3, 0.25, 0.4)], target="mug")
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tdanet_jax import config as configs
+from tdanet_jax.checkpoint import FOLDER, Checkpoints
+from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.env import Observation
+from tdanet_jax.models import actor_critic
+from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.layers import Carry
+from tdanet_jax.task import make_model
+from tdanet_jax.vocabulary import NUM_ACTIONS, Action
+from tdanet_jax.words import WordVectors, load_bundled
+
+#: Rows and labels are padded to multiples of these, so that few shapes are ever compiled.
+ROW_BLOCK, LABEL_BLOCK = 16, 64
+
+
+@dataclasses.dataclass(frozen=True)
+class Detection:
+    """One detected object: a label in English and its box as shares of the image, y down."""
+
+    label: str
+    x1: float
+    y1: float
+    x2: float
+    y2: float
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if the box is not one inside the image."""
+        if not (0 <= self.x1 <= self.x2 <= 1 and 0 <= self.y1 <= self.y2 <= 1):
+            raise ValueError(f"{self}: corners must be shares of the image, x1 <= x2 and y1 <= y2")
+
+
+class Memory(NamedTuple):
+    """What the agent carries from step to step of one episode."""
+
+    carry: Carry  # each [1, H]
+    previous: jax.Array  # [1, 6], action probabilities of the step before
+
+
+class Decision(NamedTuple):
+    """What the agent does, and why."""
+
+    action: Action
+    probabilities: np.ndarray  # [6], in the order of `Action`
+    value: float  # expected discounted return
+    attention: np.ndarray  # [n], weight of each detection; sums to 1 unless there is none
+
+
+class Agent:
+    """A trained network with its configuration and word vectors.
+
+    Attributes:
+      config: the training run's configuration.
+      model, weights: the network and its parameters.
+    """
+
+    def __init__(self, config: TrainConfig, weights: Any, vectors: WordVectors) -> None:
+        self.config = config
+        self.model: ActorCritic = make_model(config.network)
+        self.weights = weights
+        self._vectors = vectors
+        self._labels: dict[str, int] = {}
+        self._table: Any = None
+        self._decide = jax.jit(self._forward)
+
+    def start(self) -> Memory:
+        """The memory at the start of an episode."""
+        return Memory(self.model.initial_carry(1), jnp.zeros((1, NUM_ACTIONS)))
+
+    def act(
+        self,
+        memory: Memory,
+        detections: Sequence[Detection],
+        target: str,
+        key: jax.Array | None = None,
+    ) -> tuple[Memory, Decision]:
+        """One step.
+
+        Args:
+          memory: from `start` or the step before.
+          detections: the objects in view, in any order.
+          target: what to look for, in English.
+          key: samples the action, as in training; None takes the most probable one.
+
+        Raises:
+          KeyError: a label has a word without a word vector.
+        """
+        rows = max(-(-len(detections) // ROW_BLOCK), 1) * ROW_BLOCK
+        classes, boxes = np.zeros((1, rows), np.int32), np.zeros((1, rows, 3), np.float32)
+        for i, d in enumerate(detections):
+            classes[0, i] = self._index(d.label)
+            area = (d.x2 - d.x1) * (d.y2 - d.y1)
+            boxes[0, i] = (d.x1 + d.x2) / 2, (d.y1 + d.y2) / 2, area
+        obs = Observation(
+            classes=jnp.asarray(classes),
+            boxes=jnp.asarray(boxes),
+            mask=jnp.arange(rows)[None] < len(detections),
+            target=jnp.full(1, self._index(target), jnp.int32),
+            empty=jnp.full(1, not detections),
+        )
+        carry, logits, value, attention = self._decide(self.weights, self._prepared(), memory, obs)
+        best = jnp.argmax(logits, -1) if key is None else jax.random.categorical(key, logits)
+        probabilities = jax.nn.softmax(logits)
+        decision = Decision(
+            action=Action(int(best[0])),
+            probabilities=np.asarray(probabilities[0]),
+            value=float(value[0]),
+            attention=np.asarray(attention[0, : len(detections)]),
+        )
+        return Memory(carry, probabilities), decision
+
+    def _index(self, label: str) -> int:
+        """The row of a label in the table of classes; a new label gets a new row."""
+        if label not in self._labels:
+            self._vectors.embed(label)  # an unknown word is an error before anything changes
+            self._labels[label] = len(self._labels)
+            self._table = None
+        return self._labels[label]
+
+    def _prepared(self) -> Any:
+        if self._table is None:
+            table = self._vectors.table(tuple(self._labels), self.config.network.word_norm)
+            rest = -len(table) % LABEL_BLOCK
+            words = jnp.asarray(np.pad(table, ((0, rest), (0, 0))))
+            self._table = actor_critic.prepare(self.model, self.weights, words)
+        return self._table
+
+    def _forward(
+        self, weights: Any, table: Any, memory: Memory, obs: Observation
+    ) -> tuple[Carry, jax.Array, jax.Array, jax.Array]:
+        attention = self.model.apply({"params": weights}, table, obs, method="attention")
+        carry, out = actor_critic.forward(
+            self.model, weights, table, memory.carry, obs, memory.previous, jnp.zeros(1, bool)
+        )
+        return carry, out.logits, out.value, jnp.asarray(attention)
+
+
+def load(run: Path | str) -> Agent:
+    """The agent of a training run's newest checkpoint. Needs no rooms.
+
+    Raises:
+      ValueError: the folder holds no run, or its checkpoint cannot be read.
+    """
+    run = Path(run)
+    config = configs.load(run / CONFIG_FILE)
+    if not (run / FOLDER).is_dir():
+        raise ValueError(f"{run / FOLDER}: no checkpoint")
+    return Agent(config, Checkpoints(run).weights(), load_bundled())

@@ -1,0 +1,92 @@
+"""A trained agent on its own: what it decides is what the network in the environment decides."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import tdanet_jax
+from tdanet_jax import env
+from tdanet_jax.agent import Agent, Detection
+from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.models import actor_critic
+from tdanet_jax.reward import find_parents
+from tdanet_jax.task import make_model
+from tdanet_jax.vocabulary import TARGETS, Action
+
+CONFIG = TrainConfig(network=NetworkConfig(width=16, hidden=16, precision="float32"))
+
+
+@pytest.fixture(scope="module")
+def weights(glove):
+    model = make_model(CONFIG.network)
+    return model.initialise(jax.random.key(3), jnp.asarray(glove.table(["Mug", "Bed"])))
+
+
+@pytest.fixture
+def agent(weights, glove):
+    return Agent(CONFIG, weights, glove)
+
+
+def detections_of(tables, pose):
+    rows = slice(tables.row_start[pose], tables.row_start[pose + 1])
+    names = [tables.classes[c] for c in tables.row_class[rows]]
+    boxes = tables.row_box[rows] / (tables.image * tables.subpixel)
+    return [Detection(name, *map(float, box)) for name, box in zip(names, boxes, strict=True)]
+
+
+def test_it_decides_as_the_network_does_in_the_environment(agent, weights, some_rooms, glove):
+    parents = find_parents(some_rooms, TARGETS)
+    params = env.make_params(some_rooms, TARGETS, parents, env.TEST_STEP_LIMITS, merge=False)
+    model = agent.model
+    table = actor_critic.prepare(model, weights, jnp.asarray(glove.table(some_rooms.classes)))
+    goal = some_rooms.targets.index("Mug")
+    memory, carry, previous = agent.start(), model.initial_carry(1), jnp.zeros((1, 6))
+    for pose in (1001, 1003, 1019):
+        one = jnp.array([pose]), jnp.array([goal])
+        state = jax.vmap(env.start, (None, 0, 0))(params, *one)
+        obs = jax.vmap(env.observe, (0, None))(state, params)
+        fresh = jnp.zeros(1, bool)
+        carry, out = actor_critic.forward(model, weights, table, carry, obs, previous, fresh)
+        previous = jax.nn.softmax(out.logits)
+        memory, decision = agent.act(memory, detections_of(some_rooms, pose), "Mug")
+        np.testing.assert_allclose(decision.probabilities, previous[0], rtol=1e-4)
+        np.testing.assert_allclose(decision.value, out.value[0], rtol=1e-4, atol=1e-6)
+        assert decision.action == Action(int(decision.probabilities.argmax()))
+
+
+def test_attention_sums_to_one_over_the_detections_and_none_is_fine(agent):
+    seen = [Detection("coffee machine", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.5, 0.5, 1, 1)]
+    memory, decision = agent.act(agent.start(), seen, "toaster")
+    assert decision.attention.shape == (2,)
+    assert decision.attention.sum() == pytest.approx(1, abs=1e-5)
+    _, blank = agent.act(memory, [], "toaster")
+    assert blank.attention.shape == (0,)
+    assert np.isfinite(blank.probabilities).all()
+
+
+def test_order_and_new_labels_change_nothing(agent):
+    seen = [Detection(name, 0.1, 0.1, 0.3, 0.4) for name in ("sink", "mug", "plate")]
+    _, first = agent.act(agent.start(), seen, "mug")
+    agent.act(agent.start(), [Detection("zebra", 0, 0, 1, 1)], "giraffe")
+    _, second = agent.act(agent.start(), seen[::-1], "mug")
+    np.testing.assert_allclose(first.probabilities, second.probabilities, rtol=1e-5)
+    np.testing.assert_allclose(first.attention, second.attention[::-1], rtol=1e-5)
+
+
+def test_a_key_samples_and_the_same_key_samples_the_same(agent):
+    seen = [Detection("mug", 0.1, 0.1, 0.3, 0.4)]
+    keys = jax.random.split(jax.random.key(0), 20)
+    actions = [agent.act(agent.start(), seen, "mug", key)[1].action for key in keys]
+    again = [agent.act(agent.start(), seen, "mug", key)[1].action for key in keys]
+    assert actions == again
+    assert len(set(actions)) > 1
+
+
+def test_bad_input_is_refused(agent, tmp_path):
+    with pytest.raises(KeyError, match="qwertzu"):
+        agent.act(agent.start(), [], "qwertzu")
+    with pytest.raises(ValueError, match="corners must be shares"):
+        Detection("mug", 120, 80, 160, 130)
+    with pytest.raises(ValueError, match="is this the folder of a run"):
+        tdanet_jax.load(tmp_path)
