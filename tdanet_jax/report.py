@@ -72,9 +72,6 @@ def columns(tables: SceneTables, episodes: Episodes, records: Records) -> dict[s
 def results(provenance: Provenance, groups: Mapping[str, Mapping[str, np.ndarray]]) -> dict:
     """The content of `results.json`, from the columns of each group."""
 
-    def summary(c: Mapping[str, np.ndarray]) -> dict:
-        return summarise(c["success"], c["shortest"], c["length"], c["cluster"])
-
     def by(key: str, names: tuple[str, ...]) -> dict:
         split = {group: grouped(c, key, names) for group, c in groups.items()}
         found = (name for name in names if any(name in parts for parts in split.values()))
@@ -86,8 +83,8 @@ def results(provenance: Provenance, groups: Mapping[str, Mapping[str, np.ndarray
     return {
         "version": RESULTS_VERSION,
         **{k: v for k, v in dataclasses.asdict(provenance).items() if k in _HEAD},
-        "seen": summary(groups["seen"]),
-        "unseen": summary(groups["unseen"]) if "unseen" in groups else None,
+        "seen": _summary(groups["seen"]),
+        "unseen": _summary(groups["unseen"]) if "unseen" in groups else None,
         "by_room": by("room", ROOM_TYPES),
         "by_target": by("target", ALL_TARGETS),
         "seed": provenance.seed,
@@ -95,6 +92,10 @@ def results(provenance: Provenance, groups: Mapping[str, Mapping[str, np.ndarray
         "data_version": provenance.data_version,
         "commit": code_version(),
     }
+
+
+def _summary(column: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+    return summarise(*(column[name] for name in ("success", "shortest", "length", "cluster")))
 
 
 _HEAD = ("split", "model", "policy", "episodes_trained")
@@ -171,6 +172,10 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarra
             lines.append(f"| {group} | {agent} (paper) | {sr} | {rate} | | | | |")
     if any(key[0] == out["split"] for key in PAPER_ROWS):
         lines += ["", WORLDS_DIFFER]
+    if "unseen" in groups and (apart := _near_synonyms(groups["unseen"])):
+        known = "; ".join(f"{name}: {', '.join(like)}" for name, like in NEAR_SYNONYMS.items())
+        lines += ["", f"Unseen classes with a near-synonym known in training ({known}) apart:"]
+        lines += ["", *_header("Targets", "Classes"), *apart]
     lines.append("")
     for group, column in groups.items():
         share = 100 * float((column["shortest"] == 1).mean())
@@ -179,20 +184,19 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarra
         lines += ["", f"## By {title.lower()}", "", *_header(title, "Group")]
         for name, parts in out[key].items():
             lines += [_row((name, group), buckets) for group, buckets in parts.items()]
-    lines += _near_synonyms(out)
     return "\n".join(lines) + "\n"
 
 
-def _near_synonyms(out: Mapping[str, Any]) -> list[str]:
-    present = {
-        target: ", ".join(like)
-        for target, like in NEAR_SYNONYMS.items()
-        if "unseen" in out["by_target"].get(target, {})
-    }
-    if not present:
-        return []
-    lines = ["", "Unseen classes with a near-synonym among the classes known in training: "]
-    return [*lines, *(f"- {target} (like {like})" for target, like in present.items())]
+def _near_synonyms(column: Mapping[str, np.ndarray]) -> list[str]:
+    """Rows for the unseen classes with and without a near-synonym known in training."""
+    like = np.isin(column["target"], list(NEAR_SYNONYMS))
+    present = sorted(set(column["target"][like].tolist()))
+    lines = []
+    for chosen, title in ((like, ", ".join(present)), (~like, f"without {', '.join(present)}")):
+        if like.any() and chosen.any():
+            part = {name: values[chosen] for name, values in column.items()}
+            lines.append(_row(("unseen", title), _summary(part)))
+    return lines
 
 
 def _header(*first: str) -> list[str]:

@@ -76,3 +76,18 @@ def test_the_page_shows_the_paper_beside_ours_and_says_that_the_worlds_differ(wr
     assert "TDANet (paper) | 74.7 | 29.7" in page
     assert "The worlds differ" in page
     assert "33.3" in page
+
+
+def test_unseen_classes_with_a_near_synonym_are_reported_apart(ithor, tmp_path):
+    goals = [ALL_TARGETS.index(name) for name in ("ToiletPaper", "Laptop")]
+    poses = [np.flatnonzero(ithor.distance[:, goal] == 2)[0] for goal in goals]
+    episodes = Episodes(np.array(poses, np.int32), np.array(goals, np.int32))
+    actions = np.full((2, 200), -1, np.int8)
+    actions[:, :3] = [0, 0, 5]
+    records = Records(np.array([3, 3]), np.array([3, 3]), np.array([True, False]), actions)
+    provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 200, ithor.data_version)
+    played = {"seen": (episodes, records), "unseen": (episodes, records)}
+    report.write(tmp_path, provenance, ithor, played)
+    page = (tmp_path / "results.md").read_text()
+    assert "| unseen | ToiletPaper | 100.0 (100.0 to 100.0) |" in page
+    assert "| unseen | without ToiletPaper | 0.0 (0.0 to 0.0) |" in page
