@@ -84,10 +84,6 @@ class Checkpoints:
             ) from error
         return restored["state"], dict(restored["meta"])
 
-    def close(self) -> None:
-        """Waits for what is being written."""
-        self._manager.close()
-
 
 def _plain(state: TrainState) -> TrainState:
     """The state with its random key as integers, which is what a file can hold."""
