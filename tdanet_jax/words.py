@@ -36,11 +36,6 @@ class WordVectors:
     index: dict[str, int]
     vectors: np.ndarray
 
-    @property
-    def width(self) -> int:
-        """D, the width of a vector."""
-        return int(self.vectors.shape[1])
-
     def embed(self, name: str, norm: float = DEFAULT_NORM) -> np.ndarray:
         """The vector of a class name or label: the mean over its words, scaled to `norm`.
 
