@@ -130,7 +130,7 @@ def other_words(
     changed = {word for name in names for word in class_words(name)} - kept
     table = vectors.vectors.copy()
     rows = [vectors.index[word] for word in sorted(changed)]
-    table[rows] = np.random.default_rng(0).normal(size=(len(rows), vectors.width))
+    table[rows] = np.random.default_rng(0).normal(size=(len(rows), vectors.vectors.shape[1]))
     return WordVectors(vectors.index, table)
 
 
