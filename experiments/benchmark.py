@@ -251,9 +251,9 @@ def update_row(task: Task, precision: str, count: int, peak: float | None, repea
     from tdanet_jax import learner
     from tdanet_jax.task import make_model
 
-    network: Any = NetworkConfig(precision=precision)  # type: ignore[arg-type]
+    network = NetworkConfig(precision=precision)  # type: ignore[arg-type]
     config = LearnerConfig(num_envs=count)
-    model = make_model(network)
+    model = make_model(TrainConfig(network=network), task.classes)
     words, params = task.train_words, task.train_params
     updates = 5
     chunk = learner.make_train(config, model, updates)
@@ -287,9 +287,8 @@ def evaluation_row(task: Task, tables: Any, repeats: int) -> Row:
     import jax
 
     from tdanet_jax import episodes, evaluation, policies
-    from tdanet_jax.task import make_model
 
-    model = make_model(NetworkConfig())
+    model = task.model
     weights = model.initialise(jax.random.key(0), task.words)
     policy = policies.network(model, task.words)
     lists = episodes.load(tables, task.split)
@@ -314,9 +313,8 @@ def decision_row(task: Task, count: int, repeats: int) -> Row:
 
     from tdanet_jax import env
     from tdanet_jax.models import actor_critic
-    from tdanet_jax.task import make_model
 
-    model = make_model(NetworkConfig())
+    model = task.model
     weights = model.initialise(jax.random.key(0), task.words)
     table = actor_critic.prepare(model, weights, task.words)
     keys = jax.random.split(jax.random.key(1), count)

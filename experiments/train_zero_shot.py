@@ -2,8 +2,9 @@
 
     python -m experiments.train_zero_shot --split 18/4
 
-Writes config.json, metrics.jsonl, checkpoints, results.json, results.md, episodes.jsonl and
-learning_curve.png into --out (by default runs/<split>-<model>-seed<seed>-<time>).
+Writes config.json, classes.json, metrics.jsonl, checkpoints, results.json, results.md,
+episodes.jsonl and learning_curve.png into --out (by default
+runs/<split>-<model>-seed<seed>-<time>).
 """
 
 from __future__ import annotations
@@ -99,6 +100,7 @@ def train(config: TrainConfig, folder: Path, tensorboard: bool) -> None:
     config = dataclasses.replace(config, network=resolve_precision(config.network))
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG_FILE).write_text(json.dumps(configs.to_json(config), indent=2) + "\n")
+    task.classes.save(folder)
     run = Run(folder, config, task)
     console.print(f"{config.model}, split {task.split.name}, seed {config.seed} -> {folder}")
     console.print("compiling ...")

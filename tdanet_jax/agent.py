@@ -16,15 +16,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from tdanet_jax import classes as vocabularies
 from tdanet_jax import config as configs
 from tdanet_jax.checkpoint import FOLDER, Checkpoints
+from tdanet_jax.classes import Classes
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.env import Observation
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.layers import Carry
 from tdanet_jax.task import make_model
-from tdanet_jax.vocabulary import NUM_ACTIONS, Action
+from tdanet_jax.vocabulary import NUM_ACTIONS, Action, class_words
 from tdanet_jax.words import WordVectors, load_bundled
 
 #: Rows and labels are padded to multiples of these, so that few shapes are ever compiled.
@@ -60,7 +62,7 @@ class Decision(NamedTuple):
     action: Action
     probabilities: np.ndarray  # [6], in the order of `Action`
     value: float  # expected discounted return
-    attention: np.ndarray  # [n], weight of each detection; sums to 1 unless there is none
+    attention: np.ndarray | None  # [n], weight of each detection; None if the model has none
 
 
 class Agent:
@@ -68,15 +70,28 @@ class Agent:
 
     Attributes:
       config: the training run's configuration.
+      classes: the training run's vocabulary. A model with a row per class sees objects of the
+        known classes alone; any other sees whatever has a name.
       model, weights: the network and its parameters.
     """
 
-    def __init__(self, config: TrainConfig, weights: Any, vectors: WordVectors) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        weights: Any,
+        vectors: WordVectors,
+        classes: Classes | None = None,
+    ) -> None:
         self.config = config
-        self.model: ActorCritic = make_model(config.network)
+        self.classes = Classes() if classes is None else classes
+        self.model: ActorCritic = make_model(config, self.classes)
+        if self.model.encoder.IMAGE:
+            raise ValueError(
+                f"{config.model} looks at an image; an agent is shown detections alone"
+            )
         self.weights = weights
         self._vectors = vectors
-        self._labels: dict[str, int] = {}
+        self._labels = {class_words(name): i for i, name in enumerate(self.classes.names)}
         self._table: Any = None
         self._decide = jax.jit(self._forward)
 
@@ -102,19 +117,7 @@ class Agent:
         Raises:
           KeyError: a label has a word without a word vector.
         """
-        rows = max(-(-len(detections) // ROW_BLOCK), 1) * ROW_BLOCK
-        classes, boxes = np.zeros((1, rows), np.int32), np.zeros((1, rows, 3), np.float32)
-        for i, d in enumerate(detections):
-            classes[0, i] = self._index(d.label)
-            area = (d.x2 - d.x1) * (d.y2 - d.y1)
-            boxes[0, i] = (d.x1 + d.x2) / 2, (d.y1 + d.y2) / 2, area
-        obs = Observation(
-            classes=jnp.asarray(classes),
-            boxes=jnp.asarray(boxes),
-            mask=jnp.arange(rows)[None] < len(detections),
-            target=jnp.full(1, self._index(target), jnp.int32),
-            empty=jnp.full(1, not detections),
-        )
+        obs, owner = self._observe(detections, target)
         carry, logits, value, attention = self._decide(self.weights, self._prepared(), memory, obs)
         best = jnp.argmax(logits, -1) if key is None else jax.random.categorical(key, logits)
         probabilities = jax.nn.softmax(logits)
@@ -122,21 +125,53 @@ class Agent:
             action=Action(int(best[0])),
             probabilities=np.asarray(probabilities[0]),
             value=float(value[0]),
-            attention=np.asarray(attention[0, : len(detections)]),
+            attention=None if attention is None else np.asarray(attention[0])[owner],
         )
         return Memory(carry, probabilities), decision
 
+    def _observe(
+        self, detections: Sequence[Detection], target: str
+    ) -> tuple[Observation, np.ndarray]:
+        """The frame as the network sees it, and the row of each detection.
+
+        A row per detection; for a model made for it, a row per class: the mean of the boxes'
+        corners and the extent over all of them.
+        """
+        labels = np.array([self._index(d.label) for d in detections], np.int32)
+        corners = np.array([(d.x1, d.y1, d.x2, d.y2) for d in detections]).reshape(-1, 4)
+        owner = np.arange(len(detections))
+        if (self.model.encoder.ROWS or self.config.network.rows) == "class":
+            labels, owner = np.unique(labels, return_inverse=True)
+        count = len(labels)
+        rows = max(-(-count // ROW_BLOCK), 1) * ROW_BLOCK
+        classes, boxes = np.zeros((1, rows), np.int32), np.zeros((1, rows, 3), np.float32)
+        classes[0, :count] = labels
+        for i in range(count):
+            own = corners[owner == i]
+            width, height = own[:, 2:].max(axis=0) - own[:, :2].min(axis=0)
+            boxes[0, i] = *(own[:, :2] + own[:, 2:]).mean(axis=0) / 2, width * height
+        observation = Observation(
+            classes=jnp.asarray(classes),
+            boxes=jnp.asarray(boxes),
+            mask=jnp.arange(rows)[None] < count,
+            target=jnp.full(1, self._index(target), jnp.int32),
+            empty=jnp.full(1, not detections),
+        )
+        return observation, owner
+
     def _index(self, label: str) -> int:
         """The row of a label in the table of classes; a new label gets a new row."""
-        if label not in self._labels:
+        words = class_words(label)
+        if words not in self._labels:
             self._vectors.embed(label)  # an unknown word is an error before anything changes
-            self._labels[label] = len(self._labels)
+            self._labels[words] = len(self._labels)
             self._table = None
-        return self._labels[label]
+        return self._labels[words]
 
     def _prepared(self) -> Any:
         if self._table is None:
-            table = self._vectors.table(tuple(self._labels), self.config.network.word_norm)
+            names = [" ".join(words) for words in self._labels]
+            table = self._vectors.table(names, self.config.network.word_norm)
             rest = -len(table) % LABEL_BLOCK
             words = jnp.asarray(np.pad(table, ((0, rest), (0, 0))))
             self._table = actor_critic.prepare(self.model, self.weights, words)
@@ -144,12 +179,13 @@ class Agent:
 
     def _forward(
         self, weights: Any, table: Any, memory: Memory, obs: Observation
-    ) -> tuple[Carry, jax.Array, jax.Array, jax.Array]:
-        attention = self.model.apply({"params": weights}, table, obs, method="attention")
+    ) -> tuple[Carry, jax.Array, jax.Array, jax.Array | None]:
+        variables = {"params": weights}
+        attention: Any = self.model.apply(variables, table, obs, method="attention")
         carry, out = actor_critic.forward(
             self.model, weights, table, memory.carry, obs, memory.previous, jnp.zeros(1, bool)
         )
-        return carry, out.logits, out.value, jnp.asarray(attention)
+        return carry, out.logits, out.value, attention
 
 
 def load(run: Path | str) -> Agent:
@@ -162,4 +198,5 @@ def load(run: Path | str) -> Agent:
     config = configs.load(run / CONFIG_FILE)
     if not (run / FOLDER).is_dir():
         raise ValueError(f"{run / FOLDER}: no checkpoint")
-    return Agent(config, Checkpoints(run).weights(), load_bundled())
+    classes = vocabularies.load(run)
+    return Agent(config, Checkpoints(run).weights(), load_bundled(), classes)

@@ -10,7 +10,13 @@ from typing import Any, Literal
 
 from tdanet_jax.vocabulary import UNSEEN
 
-MODELS = ("tdanet",)
+#: Models by name: the module that makes each, and the settings that it is made with.
+MODELS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "tdanet": ("tdanet_jax.models.tdanet", {}),
+    "tdanet-no-ta": ("tdanet_jax.models.tdanet", {"target_attention": False}),
+    "tdanet-no-sa": ("tdanet_jax.models.tdanet", {"siamese": False}),
+    "tdanet-no-ta-sa": ("tdanet_jax.models.tdanet", {"target_attention": False, "siamese": False}),
+}
 #: Name of the file in a run's folder that holds its configuration.
 CONFIG_FILE = "config.json"
 
@@ -78,7 +84,9 @@ class TrainConfig:
     split: str = "18/4"
     """Seen/unseen target classes: 22/0, 18/4 or 14/8."""
     model: str = "tdanet"
-    """The model to train: tdanet."""
+    """The model to train: tdanet, one of its ablations (tdanet-no-ta without target attention,
+    tdanet-no-sa without the Siamese comparison, tdanet-no-ta-sa without either), or the dotted name
+    of a module of your own that has a function `make`."""
     steps: int = 12_000_000
     """Budget in environment steps (actions)."""
     episodes: int | None = None
@@ -105,8 +113,9 @@ class TrainConfig:
         """Raises ValueError, with one line that names the flag, if a value is out of range."""
         if self.split not in UNSEEN:
             raise ValueError(f"--split {self.split}: choose one of {', '.join(UNSEEN)}")
-        if self.model not in MODELS:
-            raise ValueError(f"--model {self.model}: choose one of {', '.join(MODELS)}")
+        if self.model not in MODELS and "." not in self.model:
+            known = ", ".join(MODELS)
+            raise ValueError(f"--model {self.model}: choose one of {known}, or name a module")
         positive = {
             "--steps": self.steps,
             "--episodes": self.episodes,

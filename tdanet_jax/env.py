@@ -24,6 +24,8 @@ from tdanet_jax.vocabulary import ROOM_TYPES, Action
 #: A pose is (position * 8 + rotation) * 2 + horizon.
 ROTATIONS = 8
 POSES_PER_POSITION = 16
+#: Rows and columns of the class raster, the size of a ResNet-18 feature map.
+RASTER = (7, 7)
 #: Steps after which a test episode ends, by room type (Du et al. 2020 and its successors).
 TEST_STEP_LIMITS = (100, 200, 100, 100)
 
@@ -48,6 +50,7 @@ class EnvParams(struct.PyTreeNode):
     pair_target: jax.Array  # [Q] int32, the target of a pair
     pair_starts: jax.Array  # [Q, 2] int32, first and number of a pair's start positions
     start_position: jax.Array  # [sum] int32, positions from which the pair's target can be reached
+    raster: jax.Array | None  # [S, 7, 7] int8, class of each image cell, -1 none; if anyone looks
     max_detections: int = struct.field(pytree_node=False)  # K, most detections in any pose
 
 
@@ -69,6 +72,7 @@ class Observation(struct.PyTreeNode):
     mask: jax.Array  # [K] bool, False in padding
     target: jax.Array  # int32, class of the target
     empty: jax.Array  # bool, no detection at all
+    cells: jax.Array | None = None  # [7, 7] int32, class of each image cell, -1 none; if asked for
 
 
 class Outcome(NamedTuple):
@@ -87,6 +91,7 @@ def make_params(
     parents: Parents,
     step_limits: Sequence[int],
     merge: bool,
+    image: bool = False,
 ) -> EnvParams:
     """Puts scene tables into the arrays that the environment reads.
 
@@ -96,6 +101,7 @@ def make_params(
       parents: parents of every target and their rewards.
       step_limits: actions after which an episode is truncated, by room type.
       merge: one detection per class and pose (extent over its instances) instead of one per object.
+      image: observations hold the class raster, too.
 
     Raises:
       ValueError: no episode is possible.
@@ -117,6 +123,7 @@ def make_params(
         parent_reward=jnp.asarray(parents.reward, jnp.float32),
         step_limit=jnp.asarray(step_limits, jnp.int32),
         max_detections=longest,
+        raster=jnp.asarray(tables.raster, jnp.int8) if image else None,
         **{name: jnp.asarray(v, jnp.int32) for name, v in _episode_pool(tables, targets).items()},
     )
 
@@ -238,6 +245,7 @@ def observe(state: EnvState, params: EnvParams) -> Observation:
         mask=mask,
         target=params.target_class[state.target],
         empty=last == first,
+        cells=None if params.raster is None else params.raster[state.pose].astype(jnp.int32),
     )
 
 

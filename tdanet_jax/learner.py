@@ -115,12 +115,12 @@ def rollout(
     weights = jax.tree.map(lambda x: x.astype(model.dtype) if x.ndim > 1 else x, state.params)
     table = actor_critic.prepare(model, state.params, words)
     rate = model.encoder.dropout
-    batch, width = state.fresh.shape[0], model.encoder.width
+    batch, units = state.fresh.shape[0], model.encoder.dropout_units
 
     def act(state: TrainState, step_key: jax.Array) -> tuple[TrainState, Rollout]:
         action_key, dropout_key, reset_key = jax.random.split(step_key, 3)
         obs = observe(state.env_state, params)
-        keep = _keep(dropout_key, rate, (batch, width)) if rate else None
+        keep = _keep(dropout_key, rate, (batch, units)) if rate else None
         carry, out, tape = actor_critic.record(
             model, weights, table, state.carry, obs, state.previous, state.fresh, keep
         )

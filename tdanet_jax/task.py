@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 
 from tdanet_jax import env, zero_shot
-from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.classes import Classes, make_classes
+from tdanet_jax.config import MODELS, NetworkConfig, TrainConfig
 from tdanet_jax.env import TEST_STEP_LIMITS, EnvParams
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.tdanet import TDANetEncoder
 from tdanet_jax.reward import find_parents
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ROOM_TYPES, Split, make_split
@@ -26,6 +27,8 @@ class Task:
     Attributes:
       tables: all rooms.
       split: which rooms and classes train.
+      classes: the vocabulary, and what of it training may know.
+      model: the network.
       train_params: the training rooms, hidden classes filtered out.
       eval_params: all rooms and classes, with the test step limits.
       train_words: [C, D], zero for hidden classes.
@@ -34,6 +37,8 @@ class Task:
 
     tables: SceneTables
     split: Split
+    classes: Classes
+    model: ActorCritic
     train_params: EnvParams
     eval_params: EnvParams
     train_words: jax.Array
@@ -43,7 +48,9 @@ class Task:
 def make_task(config: TrainConfig, tables: SceneTables, vectors: WordVectors) -> Task:
     """The task of a configuration on the given rooms."""
     split = make_split(config.split, config.validation)
-    merge = config.network.rows == "class"
+    classes = make_classes(tables.classes, split.hidden)
+    model = make_model(config, classes)
+    shown = (model.encoder.ROWS or config.network.rows) == "class", model.encoder.IMAGE
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
     parents = find_parents(seen_rooms, split.seen)
     limits = [config.learner.step_limit] * len(ROOM_TYPES)
@@ -52,8 +59,10 @@ def make_task(config: TrainConfig, tables: SceneTables, vectors: WordVectors) ->
     return Task(
         tables=tables,
         split=split,
-        train_params=env.make_params(seen_rooms, split.seen, parents, limits, merge),
-        eval_params=env.make_params(tables, targets, parents, TEST_STEP_LIMITS, merge),
+        classes=classes,
+        model=model,
+        train_params=env.make_params(seen_rooms, split.seen, parents, limits, *shown),
+        eval_params=env.make_params(tables, targets, parents, TEST_STEP_LIMITS, *shown),
         train_words=jnp.asarray(zero_shot.hide_words(words, tables.classes, split.hidden)),
         words=jnp.asarray(words),
     )
@@ -70,8 +79,20 @@ def resolve_precision(config: NetworkConfig) -> NetworkConfig:
     return dataclasses.replace(config, precision="bfloat16" if fast else "float32")
 
 
-def make_model(config: NetworkConfig) -> ActorCritic:
-    """The network of a configuration."""
-    dtype = jnp.dtype(resolve_precision(config).precision)
-    encoder = TDANetEncoder(width=config.width, dropout=config.dropout, dtype=dtype)
-    return ActorCritic(encoder, hidden=config.hidden, dtype=dtype)
+def make_model(config: TrainConfig, classes: Classes) -> ActorCritic:
+    """The network of a configuration.
+
+    Raises:
+      ValueError: `config.model` names a module that cannot be imported or makes no model.
+    """
+    module_name, options = MODELS.get(config.model, (config.model, {}))
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise ValueError(f"--model {config.model}: {error}") from None
+    if not hasattr(module, "make"):
+        raise ValueError(f"--model {config.model}: the module has no function `make`")
+    network = config.network
+    dtype = jnp.dtype(resolve_precision(network).precision)
+    model: ActorCritic = module.make(network, classes, dtype, **options)
+    return model

@@ -16,7 +16,7 @@ from tdanet_jax import learner
 from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.learner import TrainState
-from tdanet_jax.task import Task, make_model
+from tdanet_jax.task import Task
 
 METRICS_FILE = "metrics.jsonl"
 
@@ -30,7 +30,7 @@ class Run:
         self.folder = folder
         self.config = config
         self.task = task
-        self.model = make_model(config.network)
+        self.model = task.model
         self.seconds = 0.0
         self.checkpoints = Checkpoints(folder)
         self.state: TrainState = self._make_state() if self.fresh else self._restore()

@@ -8,6 +8,7 @@ import pytest
 import tdanet_jax
 from tdanet_jax import env
 from tdanet_jax.agent import Agent, Detection
+from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.models import actor_critic
 from tdanet_jax.reward import find_parents
@@ -19,7 +20,7 @@ CONFIG = TrainConfig(network=NetworkConfig(width=16, hidden=16, precision="float
 
 @pytest.fixture(scope="module")
 def weights(glove):
-    model = make_model(CONFIG.network)
+    model = make_model(CONFIG, Classes())
     return model.initialise(jax.random.key(3), jnp.asarray(glove.table(["Mug", "Bed"])))
 
 

@@ -10,7 +10,7 @@ import pytest
 from tdanet_jax import words
 from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
-from tdanet_jax.task import make_task
+from tdanet_jax.task import make_model, make_task
 from tdanet_jax.training import Run, read_metrics
 
 #: Eight chunks of two updates of 8 x 5 steps.
@@ -125,8 +125,9 @@ def test_a_damaged_checkpoint_is_one_clear_line(whole, task, tmp_path):
 
 def test_a_checkpoint_of_another_network_is_refused(whole, task):
     wider = dataclasses.replace(TINY, network=NetworkConfig(width=24, hidden=16))
+    other = dataclasses.replace(task, model=make_model(wider, task.classes))
     with pytest.raises(ValueError, match="unreadable checkpoint"):
-        Run(whole[0], wider, task)
+        Run(whole[0], wider, other)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

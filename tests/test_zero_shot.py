@@ -19,7 +19,7 @@ import pytest
 from tdanet_jax import env, learner, zero_shot
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.scenes import SceneTables
-from tdanet_jax.task import make_model, make_task
+from tdanet_jax.task import make_task
 from tdanet_jax.vocabulary import ROOM_TYPES, Split, class_words, make_split
 from tdanet_jax.words import WordVectors
 from tests.handmade import FRAME
@@ -187,7 +187,7 @@ def test_perturbing_all_hidden_data_changes_no_parameter(
     config = config_of("18/4", False)
     hidden = make_split("18/4").hidden
     noisy = perturbed(rooms, hidden, seed=2)
-    model = make_model(config.network)
+    model = make_task(config, rooms, glove).model
     chunk = learner.make_train(config.learner, model, 2)
     states = []
     for tables, vectors in ((rooms, glove), (noisy, other_words(glove, hidden, rooms.classes))):

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from tdanet_jax.env import Observation
+from tdanet_jax.env import RASTER, Observation
+from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import LSTM, TAPE, Carry, Linear
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
@@ -24,19 +25,20 @@ class ActorCritic(nn.Module):
     """An encoder, the previous step's action probabilities, an LSTM, an actor and a critic.
 
     Attributes:
-      encoder: a module with `prepare(words) -> table` and `(table, obs, keep) -> features`.
+      encoder: the model's own part.
       hidden: units of the LSTM.
       action_width: units of the embedding of the previous action probabilities.
       dtype: operands of the LSTM's products.
     """
 
-    encoder: nn.Module
+    encoder: Encoder
     hidden: int = 512
     action_width: int = 10
     dtype: Any = jnp.float32
 
     def setup(self) -> None:
-        self.action_embedding = Linear(self.action_width)
+        if self.encoder.ACTION != "plain":
+            self.action_embedding = Linear(self.action_width)
         self.lstm = LSTM(self.hidden, self.dtype)
         small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
         self.actor = Linear(NUM_ACTIONS, kernel_init=small)
@@ -63,17 +65,19 @@ class ActorCritic(nn.Module):
           obs: observations.
           previous: [..., 6] action probabilities of the previous step; zeros where fresh.
           fresh: [...] bool, True where an episode starts.
-          keep: [..., H] bool, units that dropout keeps; None when not training.
+          keep: [..., units] bool, units that dropout keeps; None when not training.
         """
-        features = self.encoder(table, obs, keep)
-        action = nn.relu(self.action_embedding(previous))
-        carry, hidden = self.lstm(carry, features, action, fresh)
+        action = previous
+        if self.encoder.ACTION != "plain":
+            action = nn.relu(self.action_embedding(previous))
+        features = self.encoder(table, obs, action, keep)
+        aside = action[..., :0] if self.encoder.ACTION == "inside" else action
+        carry, hidden = self.lstm(carry, features, aside, fresh)
         return carry, Output(self.actor(hidden), self.critic(hidden)[..., 0])
 
-    def attention(self, table: Any, obs: Observation) -> jax.Array:
-        """The encoder's weights over the detections, [..., K]."""
-        weights: jax.Array = self.encoder.attend(table, obs)
-        return weights
+    def attention(self, table: Any, obs: Observation) -> jax.Array | None:
+        """The encoder's weights over the detections, [..., K]; None if it has none."""
+        return self.encoder.attend(table, obs)
 
     def initial_carry(self, batch: int) -> Carry:
         """The recurrent state at the start of an episode: zeros."""
@@ -89,6 +93,7 @@ class ActorCritic(nn.Module):
                 mask=jnp.zeros((1, 1), bool),
                 target=jnp.zeros((1,), jnp.int32),
                 empty=jnp.ones((1,), bool),
+                cells=jnp.full((1, *RASTER), -1, jnp.int32) if self.encoder.IMAGE else None,
             )
             previous, fresh = jnp.zeros((1, NUM_ACTIONS)), jnp.ones((1,), bool)
             table = module.prepare(words)

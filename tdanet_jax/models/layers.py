@@ -9,6 +9,7 @@ it again. Gradients are those of the plain form.
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any
 
 import jax
@@ -31,10 +32,14 @@ def _keeps_transposed(dtype: Any) -> bool:
     return jnp.dtype(dtype) == jnp.bfloat16 and jax.default_backend() == "cpu"
 
 
+def _rows(a: jax.Array) -> jax.Array:
+    """[..., n] -> [rows, n], where n may be 0."""
+    return a.reshape(math.prod(a.shape[:-1]), a.shape[-1])
+
+
 def _dot(a: jax.Array, b: jax.Array, dtype: Any) -> jax.Array:
     """a [..., n] @ b [n, m] with operands in `dtype`, accumulated and returned in float32."""
-    rows = a.reshape(-1, a.shape[-1]).astype(dtype)
-    out = jnp.dot(rows, b.astype(dtype), preferred_element_type=jnp.float32)
+    out = jnp.dot(_rows(a).astype(dtype), b.astype(dtype), preferred_element_type=jnp.float32)
     return out.reshape(*a.shape[:-1], b.shape[-1])
 
 
@@ -84,8 +89,7 @@ def _product_fwd(x: jax.Array, kernel: jax.Array, dtype: Any) -> tuple[jax.Array
 
 def _product_bwd(dtype: Any, saved: tuple, cotangent: jax.Array) -> tuple[jax.Array, jax.Array]:
     x, kernel = saved
-    rows, cotangent_rows = (a.reshape(-1, a.shape[-1]) for a in (x, cotangent))
-    return _dot(cotangent, kernel.T, dtype), _dot(rows.T, cotangent_rows, dtype)
+    return _dot(cotangent, kernel.T, dtype), _dot(_rows(x).T, _rows(cotangent), dtype)
 
 
 product.defvjp(_product_fwd, _product_bwd)
@@ -143,8 +147,9 @@ class Linear(nn.Module):
         """[..., n] -> [..., features]."""
         kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        records = self.is_mutable_collection(TAPE)
-        if self.has_variable(TAPE, "product") and not records:
+        # One row per environment is recorded; products over more than that are taken again.
+        records = self.is_mutable_collection(TAPE) and x.ndim == 2
+        if self.has_variable(TAPE, "product") and not self.is_mutable_collection(TAPE):
             return recall_product(x, kernel, self.dtype, *self.get_variable(TAPE, "product")) + bias
         y = product(x, kernel, self.dtype)
         if records:

@@ -21,7 +21,11 @@ import jax.numpy as jnp
 from flax import linen as nn
 from flax import struct
 
+from tdanet_jax.classes import Classes
+from tdanet_jax.config import NetworkConfig
 from tdanet_jax.env import Observation
+from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import Linear
 
 #: Centre and area that stand before the target's word vector in its row.
@@ -37,12 +41,12 @@ class ClassTable(struct.PyTreeNode):
     reference: jax.Array  # [C_t, H], the target's branch of the Siamese comparison
 
 
-class TDANetEncoder(nn.Module):
+class TDANetEncoder(Encoder):
     """Detections and a target class in, H features out.
 
     Attributes:
       width: H, units of every layer.
-      dropout: share of the absolute difference that is dropped in training.
+      dropout: share of the absolute difference that is dropped in training; the paper's is 0.25.
       target_attention: False replaces TA by the mean of the detections (the paper's Table IV).
       siamese: False replaces SA by the attended feature alone (Table IV). With neither, nothing
         would be left of the target, so its word vector is appended to the features.
@@ -50,10 +54,14 @@ class TDANetEncoder(nn.Module):
     """
 
     width: int = 512
-    dropout: float = 0.25
     target_attention: bool = True
     siamese: bool = True
     dtype: Any = jnp.float32
+
+    @property
+    def dropout_units(self) -> int:
+        """H: dropout acts on the absolute difference."""
+        return self.width
 
     def setup(self) -> None:
         def linear() -> Linear:
@@ -98,18 +106,13 @@ class TDANetEncoder(nn.Module):
         return nn.softmax(logits, axis=-1, where=mask)
 
     def __call__(
-        self, table: ClassTable, obs: Observation, keep: jax.Array | None = None
+        self,
+        table: ClassTable,
+        obs: Observation,
+        action: jax.Array,
+        keep: jax.Array | None = None,
     ) -> jax.Array:
-        """The features of a batch of observations.
-
-        Args:
-          table: from `prepare`, with the same parameters.
-          obs: observations with leading axes [...].
-          keep: [..., H] bool, which units dropout keeps; None when not training.
-
-        Returns:
-          [..., H] float32.
-        """
+        """The features of a batch of observations, [..., H]."""
         weights = self.attend(table, obs)
         chex.assert_equal_shape([weights, obs.mask, obs.classes])
         # The all-zero row of an empty frame has no word vector either.
@@ -124,6 +127,24 @@ class TDANetEncoder(nn.Module):
         if not self.siamese and not self.target_attention:
             features = jnp.concatenate([features, table.words[obs.target]], axis=-1)
         return nn.relu(self.linear4(nn.relu(self.linear3(features))))
+
+
+def make(
+    config: NetworkConfig,
+    classes: Classes,
+    dtype: Any,
+    target_attention: bool = True,
+    siamese: bool = True,
+) -> ActorCritic:
+    """TDANet, or one of its ablations."""
+    encoder = TDANetEncoder(
+        dropout=config.dropout,
+        width=config.width,
+        target_attention=target_attention,
+        siamese=siamese,
+        dtype=dtype,
+    )
+    return ActorCritic(encoder, hidden=config.hidden, dtype=dtype)
 
 
 @jax.custom_vjp

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import pytest
 
 from experiments import benchmark
-from tdanet_jax.config import NetworkConfig
+from tdanet_jax.classes import Classes
+from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.task import make_model
 
 
@@ -41,7 +42,8 @@ def test_wrong_arguments_give_one_line(tmp_path, capsys, arguments, message):
 
 def test_the_hand_formula_counts_the_kernels_that_a_step_uses():
     """All kernels but W_L's, which is used once per update for the table of classes."""
-    model = make_model(NetworkConfig(width=32, hidden=48, precision="float32"))
+    network = NetworkConfig(width=32, hidden=48, precision="float32")
+    model = make_model(TrainConfig(network=network), Classes())
     weights = model.initialise(jax.random.key(0), jnp.ones((5, 50)))
     del weights["encoder"]["attention"]
     kernels = sum(leaf.size for leaf in jax.tree.leaves(weights) if leaf.ndim == 2)

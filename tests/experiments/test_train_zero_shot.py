@@ -12,6 +12,7 @@ import pytest
 COMMAND = [sys.executable, "-m", "experiments.train_zero_shot"]
 TINY = ["--num-envs", "8", "--rollout-steps", "5", "--width", "16", "--hidden", "16"]
 WRITTEN = {
+    "classes.json",
     "config.json", "metrics.jsonl", "checkpoints", "results.json", "results.md", "episodes.jsonl",
     "learning_curve.png",
 }  # fmt: skip

@@ -24,7 +24,7 @@ WORDS = jnp.asarray(samples.words())
 
 
 def network(**encoder: Any) -> ActorCritic:
-    return ActorCritic(TDANetEncoder(7, **encoder), hidden=H, action_width=4)
+    return ActorCritic(TDANetEncoder(7, **{"dropout": 0.25, **encoder}), hidden=H, action_width=4)
 
 
 @functools.cache

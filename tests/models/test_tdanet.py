@@ -25,7 +25,7 @@ IDS = ["TA+SA", "SA", "TA", "neither"]
 
 
 def encoder(attention: bool = True, siamese: bool = True, dropout: float = 0.25) -> TDANetEncoder:
-    return TDANetEncoder(H, dropout, target_attention=attention, siamese=siamese)
+    return TDANetEncoder(H, dropout=dropout, target_attention=attention, siamese=siamese)
 
 
 @functools.cache
@@ -34,7 +34,7 @@ def parameters(attention: bool = True, siamese: bool = True) -> Any:
     module = encoder(attention, siamese)
 
     def both(module: TDANetEncoder, words: jax.Array) -> jax.Array:
-        return module(module.prepare(words), observations(2))
+        return module(module.prepare(words), observations(2), None)
 
     made = module.init(jax.random.key(0), jnp.asarray(samples.words()), method=both)
     return samples.randomised(made["params"])
@@ -51,7 +51,7 @@ def features(
 ) -> jax.Array:
     module = encoder(attention, siamese)
     table = module.apply({"params": params}, jnp.asarray(words), method="prepare")
-    return module.apply({"params": params}, table, obs, keep)
+    return module.apply({"params": params}, table, obs, None, keep)
 
 
 @functools.partial(jax.jit, static_argnames="attention")
@@ -290,7 +290,7 @@ def test_a_bfloat16_encoder_is_close_and_returns_float32() -> None:
     params, words, obs = parameters(), jnp.asarray(samples.words()), observations(FRAMES)
     module = TDANetEncoder(H, dtype=jnp.bfloat16)
     table = module.apply({"params": params}, words, method="prepare")
-    half = module.apply({"params": params}, table, obs)
+    half = module.apply({"params": params}, table, obs, None)
     full = features(params, obs, words)
     assert half.dtype == jnp.float32
     # Eight bits of mantissa through four layers.

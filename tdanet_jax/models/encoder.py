@@ -1,0 +1,69 @@
+"""The interface that every model meets: detections and a target class in, features out.
+
+A model is one file in this folder. It defines an `Encoder` and a function
+`make(config, classes, dtype) -> ActorCritic`, and gets its name in `tdanet_jax.config.MODELS`. The
+environment, the update, the evaluation and every command then work with it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import jax
+from flax import linen as nn
+
+from tdanet_jax.env import Observation
+
+
+class Encoder(nn.Module, kw_only=True):
+    """Base class of the encoders; the recurrent actor-critic around it is shared.
+
+    Attributes:
+      dropout: share of units that is dropped in training.
+      ROWS: the detections that it is made for: one row per "class", or None where the
+        configuration decides.
+      IMAGE: whether it looks at `Observation.cells`.
+      ACTION: how the previous step's action probabilities enter. "embedded": through a layer of
+        ten units, into the LSTM. "plain": as they are, into the LSTM. "inside": through the same
+        layer, into the encoder alone.
+    """
+
+    dropout: float = 0.0
+
+    ROWS: ClassVar[Literal["class"] | None] = None
+    IMAGE: ClassVar[bool] = False
+    ACTION: ClassVar[Literal["embedded", "plain", "inside"]] = "embedded"
+
+    @property
+    def dropout_units(self) -> int:
+        """How many units of a frame dropout decides about."""
+        return 0
+
+    def prepare(self, words: jax.Array) -> Any:
+        """Everything that depends on class names alone, from their word vectors [C', D].
+
+        The first C rows are the classes of the scene tables; an agent on its own may add labels.
+        Called once per parameter change.
+        """
+        raise NotImplementedError
+
+    def __call__(
+        self, table: Any, obs: Observation, action: jax.Array, keep: jax.Array | None = None
+    ) -> jax.Array:
+        """The features of a batch of observations.
+
+        Args:
+          table: from `prepare`, with the same parameters.
+          obs: observations with leading axes [...].
+          action: [..., 10], the embedded action probabilities of the previous step; only where
+            `ACTION` is "inside".
+          keep: [..., dropout_units] bool, which units dropout keeps; None when not training.
+
+        Returns:
+          [..., H] float32.
+        """
+        raise NotImplementedError
+
+    def attend(self, table: Any, obs: Observation) -> jax.Array | None:
+        """Attention over the detections, [..., K]; None if the model has none."""
+        return None

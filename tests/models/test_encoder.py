@@ -1,0 +1,130 @@
+"""The interface of models: how the previous action enters, and modules of the user's own."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import types
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tdanet_jax.classes import Classes
+from tdanet_jax.config import MODELS, NetworkConfig, TrainConfig
+from tdanet_jax.env import Observation
+from tdanet_jax.models import actor_critic
+from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.encoder import Encoder
+from tdanet_jax.models.layers import TAPE, Linear
+from tdanet_jax.task import make_model
+from tests.models import samples
+
+B = 3
+WORDS = jnp.asarray(samples.words())
+SMALL = TrainConfig(network=NetworkConfig(width=8, hidden=6, precision="float32"))
+
+
+class Counts(Encoder):
+    """How many detections there are, and the target's word vector."""
+
+    def prepare(self, words: jax.Array) -> jax.Array:
+        return words
+
+    def __call__(
+        self, table: Any, obs: Observation, action: jax.Array, keep: jax.Array | None = None
+    ) -> jax.Array:
+        count = obs.mask.sum(-1, keepdims=True).astype(jnp.float32)
+        return jnp.concatenate([count, table[obs.target]], axis=-1)
+
+
+class Plain(Counts):
+    ACTION = "plain"
+
+
+class Inside(Counts):
+    ACTION = "inside"
+
+    def __call__(
+        self, table: Any, obs: Observation, action: jax.Array, keep: jax.Array | None = None
+    ) -> jax.Array:
+        return jnp.concatenate([super().__call__(table, obs, action, keep), action], axis=-1)
+
+
+def logits(encoder: Encoder, previous: jax.Array) -> tuple[Any, jax.Array]:
+    model = ActorCritic(encoder, hidden=6)
+    weights = samples.randomised(model.initialise(jax.random.key(0), WORDS))
+    table = actor_critic.prepare(model, weights, WORDS)
+    state = model.initial_carry(B), samples.observations(B), previous, jnp.ones(B, bool)
+    return weights, actor_critic.forward(model, weights, table, *state)[1].logits
+
+
+@pytest.mark.parametrize(
+    ("encoder", "aside", "inputs"), [(Counts(), 10, 12), (Plain(), 6, 12), (Inside(), 0, 22)]
+)
+def test_the_previous_action_enters_where_the_model_says(
+    encoder: Encoder, aside: int, inputs: int
+) -> None:
+    previous = jnp.eye(6)[:B]
+    weights, first = logits(encoder, previous)
+    assert weights["lstm"]["kernel_aside"].shape == (aside, 24)
+    assert weights["lstm"]["kernel"].shape == (inputs, 24)
+    assert ("action_embedding" in weights) == (encoder.ACTION != "plain")
+    _, second = logits(encoder, jnp.roll(previous, 1, axis=-1))
+    assert np.all(np.abs(first - second).max(-1) > 1e-4)
+
+
+def test_products_over_more_than_one_row_per_environment_get_their_gradient_without_a_tape() -> (
+    None
+):
+    layer = Linear(4)
+    x = jax.random.normal(jax.random.key(0), (2, B, 5, 3))  # [T, B, rows, n]
+    params = samples.randomised(layer.init(jax.random.key(1), x)["params"])
+    y, tape = layer.apply({"params": params}, x[0], mutable=[TAPE])
+    assert not tape.get(TAPE)
+    np.testing.assert_allclose(y, x[0] @ params["kernel"] + params["bias"], rtol=1e-5)
+
+    def total(params: Any) -> jax.Array:
+        return (layer.apply({"params": params, TAPE: {}}, x) ** 2).sum()
+
+    def plain(params: Any) -> jax.Array:
+        return ((x @ params["kernel"] + params["bias"]) ** 2).sum()
+
+    for mine, theirs in zip(
+        *map(jax.tree.leaves, (jax.grad(total)(params), jax.grad(plain)(params))), strict=True
+    ):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_named_model_is_made_and_answers(name: str) -> None:
+    names = tuple(f"Class{i}" for i in range(samples.CLASSES))
+    model = make_model(dataclasses.replace(SMALL, model=name), Classes(names, tuple(range(7))))
+    weights = model.initialise(jax.random.key(0), WORDS)
+    table = actor_critic.prepare(model, weights, WORDS)
+    obs = samples.observations(B)
+    state = model.initial_carry(B), obs, jnp.zeros((B, 6)), jnp.ones(B, bool)
+    _, out = actor_critic.forward(model, weights, table, *state)
+    assert out.logits.shape == (B, 6)
+    assert np.isfinite(out.logits).all()
+
+
+def test_a_module_of_the_users_own_is_a_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    module: Any = types.ModuleType("my_lab.counts")
+    module.make = lambda config, classes, dtype: ActorCritic(Counts(), hidden=config.hidden)
+    monkeypatch.setitem(sys.modules, "my_lab", types.ModuleType("my_lab"))
+    monkeypatch.setitem(sys.modules, "my_lab.counts", module)
+    config = dataclasses.replace(SMALL, model="my_lab.counts")
+    config.check()
+    assert isinstance(make_model(config, Classes()).encoder, Counts)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("no_such.module", "no_such"), ("json.decoder", "has no function `make`")],
+)
+def test_a_module_that_makes_no_model_is_one_clear_error(name: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_model(dataclasses.replace(SMALL, model=name), Classes())
