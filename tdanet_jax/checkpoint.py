@@ -1,12 +1,15 @@
 """Checkpoints of a run (Orbax): everything that is needed to go on bit for bit.
 
 `DIR/checkpoints/<updates>/` holds `state` (parameters, optimiser, episodes in progress, recurrent
-state, random key, counters) and `meta` (JSON: format version, training time, data version).
+state, random key, counters), `meta` (JSON: format version, training time, data version) and
+`SHA256SUMS`, the checksums of all its files (`sha256sum -c SHA256SUMS` checks them, too).
 """
 
 from __future__ import annotations
 
 import logging
+import shutil
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,10 +17,12 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 
+from tdanet_jax import assets, files
 from tdanet_jax.learner import TrainState
 
 FORMAT = 1
 FOLDER = "checkpoints"
+CHECKSUMS = "SHA256SUMS"
 KEPT = 2
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax narrates every file it touches
@@ -27,33 +32,54 @@ class Checkpoints:
     """The checkpoints of one run's folder."""
 
     def __init__(self, run: Path) -> None:
-        options = ocp.CheckpointManagerOptions(
-            max_to_keep=KEPT, enable_async_checkpointing=False, create=True
-        )
-        self._manager = ocp.CheckpointManager((run / FOLDER).absolute(), options=options)
+        self.folder = (run / FOLDER).absolute()
+        self._orbax = ocp.Checkpointer(ocp.CompositeCheckpointHandler())
 
     def save(self, state: TrainState, meta: dict[str, Any]) -> None:
-        """Writes a checkpoint; it appears complete or not at all."""
-        self._manager.save(
-            int(state.updates),
-            args=ocp.args.Composite(
-                state=ocp.args.StandardSave(_plain(state)),
-                meta=ocp.args.JsonSave({**meta, "format": FORMAT}),
-            ),
-        )
+        """Writes a checkpoint; it appears complete or not at all. The newest two are kept.
+
+        Raises:
+          ValueError: it cannot be written; those before it are as they were.
+        """
+        updates = int(state.updates)
+        path = self.folder / str(updates)
+        fresh = self.folder / f"{files.PARTIAL}{updates}"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            shutil.rmtree(fresh, ignore_errors=True)
+            self._orbax.save(
+                fresh,
+                args=ocp.args.Composite(
+                    state=ocp.args.StandardSave(_plain(state)),
+                    meta=ocp.args.JsonSave({**meta, "format": FORMAT}),
+                ),
+            )
+            sums = "".join(f"{sha}  {name}\n" for name, sha in _checksums(fresh).items())
+            (fresh / CHECKSUMS).write_text(sums)
+            shutil.rmtree(path, ignore_errors=True)  # only a damaged one can be there
+            fresh.rename(path)
+        except Exception as error:  # Orbax and TensorStore raise many kinds, for a full disk too
+            files.remove_partial(self.folder)
+            kept = f"the one before it is {self.latest()}" if self._steps() else "there is no other"
+            reason = f"checkpoint not written ({_reason(error)}); {kept}"
+            raise ValueError(f"{path}: {reason}") from error
+        # Anything ahead of this one is what could not be read when the run went on from behind it.
+        keep = [step for step in self._steps() if step <= updates][:KEPT]
+        for step in set(self._steps()) - set(keep):
+            shutil.rmtree(self.folder / str(step))
 
     def latest(self) -> int | None:
         """The number of updates of the newest complete checkpoint."""
-        return self._manager.latest_step()
+        return next(iter(self._steps()), None)
 
     def restore(self, make_state: Callable[[], TrainState]) -> tuple[TrainState, dict[str, Any]]:
-        """The newest checkpoint.
+        """The newest checkpoint that can be read; a damaged one is passed over with a warning.
 
         Args:
           make_state: makes a state of the right shapes; only traced, never run.
 
         Raises:
-          ValueError: there is no checkpoint, or it does not fit this configuration.
+          ValueError: there is no checkpoint, or none that fits this configuration.
         """
         state, meta = self._read(jax.eval_shape(_plain, jax.eval_shape(make_state)))
         return state.replace(key=jax.random.wrap_key_data(state.key)), meta
@@ -62,29 +88,66 @@ class Checkpoints:
         """The parameters of the newest checkpoint, without knowing anything else of the run.
 
         Raises:
-          ValueError: there is no checkpoint, or it cannot be read.
+          ValueError: there is no checkpoint, or none can be read.
         """
         return self._read(None)[0]["params"]
 
+    def _steps(self) -> list[int]:
+        """The complete checkpoints, newest first."""
+        names = (path.name for path in self.folder.glob("*") if path.is_dir())
+        return sorted((int(name) for name in names if name.isdecimal()), reverse=True)
+
     def _read(self, shapes: Any) -> tuple[Any, dict[str, Any]]:
-        latest = self.latest()
-        if latest is None:
-            raise ValueError(f"{self._manager.directory}: no checkpoint")
+        faults: list[Exception] = []
+        for step in self._steps():
+            try:
+                found = self._read_one(self.folder / str(step), shapes)
+            except (ValueError, OSError) as error:
+                faults.append(error)
+                continue
+            for fault in faults:
+                warnings.warn(f"{fault}; taking checkpoint {step} in its place", stacklevel=4)
+            return found
+        raise faults[0] if faults else ValueError(f"{self.folder}: no checkpoint")
+
+    def _read_one(self, path: Path, shapes: Any) -> tuple[Any, dict[str, Any]]:
+        _verify(path)
         try:
-            restored = self._manager.restore(
-                latest,
+            restored = self._orbax.restore(
+                path,
                 args=ocp.args.Composite(
                     state=ocp.args.StandardRestore(shapes), meta=ocp.args.JsonRestore()
                 ),
             )
         except Exception as error:  # Orbax raises many kinds for a damaged folder
-            reason = str(error).strip().splitlines()[0]
-            raise ValueError(
-                f"{self._manager.directory / str(latest)}: unreadable checkpoint ({reason})"
-            ) from error
+            raise ValueError(f"{path}: unreadable checkpoint ({_reason(error)})") from error
         return restored["state"], dict(restored["meta"])
 
 
 def _plain(state: TrainState) -> TrainState:
     """The state with its random key as integers, which is what a file can hold."""
     return state.replace(key=jax.random.key_data(state.key))
+
+
+def _reason(error: Exception) -> str:
+    """The first line of an error's message."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    """sha256 by relative path of all files in a checkpoint."""
+    found = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != CHECKSUMS)
+    return {path.relative_to(folder).as_posix(): assets.sha256(path) for path in found}
+
+
+def _verify(path: Path) -> None:
+    """Raises ValueError if a file is not the one that was written. Old ones have no checksums."""
+    listed = path / CHECKSUMS
+    if not listed.exists():
+        return
+    lines = listed.read_bytes().decode(errors="replace").splitlines()
+    expected = {name: sha for sha, _, name in (line.partition("  ") for line in lines)}
+    found = _checksums(path)
+    wrong = [n for n in expected.keys() | found.keys() if expected.get(n) != found.get(n)]
+    if wrong:
+        raise ValueError(f"{path}: damaged checkpoint ({len(wrong)} files differ from {CHECKSUMS})")

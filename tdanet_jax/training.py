@@ -33,6 +33,7 @@ class Run:
         self.model = task.model
         self.seconds = 0.0
         self.checkpoints = Checkpoints(folder)
+        self._saved: int | None = None  # updates of the checkpoint that holds the present state
         self.state: TrainState = self._make_state() if self.fresh else self._restore()
 
     @property
@@ -55,13 +56,19 @@ class Run:
                 f"these are {self.task.tables.data_version}"
             )
         self.seconds = float(meta["seconds"])
+        self._saved = int(state.updates)
         return state
 
     def save(self) -> None:
-        """Writes a checkpoint of the present state, unless there is one."""
-        if self.checkpoints.latest() != int(self.state.updates):
+        """Writes a checkpoint of the present state, unless there is one.
+
+        Raises:
+          ValueError: it cannot be written; those before it are as they were.
+        """
+        if self._saved != int(self.state.updates):
             version = self.task.tables.data_version
             self.checkpoints.save(self.state, {"seconds": self.seconds, "data_version": version})
+            self._saved = int(self.state.updates)
 
     @property
     def steps(self) -> int:

@@ -118,7 +118,7 @@ def test_a_damaged_checkpoint_is_one_clear_line(whole, task, tmp_path):
     for file in (tmp_path / "checkpoints").rglob("*"):
         if file.is_file() and file.stat().st_size > 1000:
             file.write_bytes(file.read_bytes()[:100])
-    with pytest.raises(ValueError, match="unreadable checkpoint") as caught:
+    with pytest.raises(ValueError, match="damaged checkpoint") as caught:
         Run(tmp_path, TINY, task)
     assert "\n" not in str(caught.value)
 
