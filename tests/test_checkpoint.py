@@ -16,15 +16,23 @@ import pytest
 
 from tdanet_jax import checkpoint, files
 from tdanet_jax.checkpoint import Checkpoints
-from tdanet_jax.config import LearnerConfig, NetworkConfig
+from tdanet_jax.classes import Classes
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.env import EnvParams
 from tdanet_jax.learner import TrainState, init
+from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.task import make_model
 from tests.handmade import lopsided
 from tests.test_env import params_of
 
-MODEL = make_model(NetworkConfig(width=8, hidden=8, precision="float32"))
+
+def network(width: int) -> ActorCritic:
+    config = NetworkConfig(width=width, hidden=8, precision="float32")
+    return make_model(TrainConfig(network=config), Classes())
+
+
+MODEL = network(8)
 TABLES: SceneTables = lopsided()
 PARAMS: EnvParams = params_of(TABLES)
 WORDS = jnp.asarray(np.random.default_rng(0).normal(size=(len(TABLES.classes), 5)), jnp.float32)
@@ -178,7 +186,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_those_before_it(
 
 
 def test_a_checkpoint_of_another_network_is_refused(saved: Checkpoints) -> None:
-    wider = make_model(NetworkConfig(width=9, hidden=8, precision="float32"))
+    wider = network(9)
     config = dataclasses.replace(LearnerConfig(), num_envs=4)
     with pytest.raises(ValueError, match="unreadable checkpoint"):
         saved.restore(lambda: init(jax.random.key(0), config, wider, WORDS, PARAMS))
