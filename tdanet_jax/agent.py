@@ -18,6 +18,7 @@ import numpy as np
 
 from tdanet_jax import classes as vocabularies
 from tdanet_jax import config as configs
+from tdanet_jax import history
 from tdanet_jax.checkpoint import FOLDER, Checkpoints
 from tdanet_jax.classes import Classes
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
@@ -189,12 +190,18 @@ class Agent:
 
 
 def load(run: Path | str) -> Agent:
-    """The agent of a training run's newest checkpoint. Needs no rooms.
+    """The agent of a run's newest checkpoint, or of a point of its history. Needs no rooms.
+
+    Args:
+      run: the run's folder, or a file `history/<updates>.npz` in it.
 
     Raises:
       ValueError: the folder holds no run, or its checkpoint cannot be read.
     """
     run = Path(run)
+    if run.suffix == history.SUFFIX:
+        config = configs.load(run.parent.parent / CONFIG_FILE)
+        return Agent(config, history.read(run).weights, load_bundled())
     config = configs.load(run / CONFIG_FILE)
     if not (run / FOLDER).is_dir():
         raise ValueError(f"{run / FOLDER}: no checkpoint")

@@ -102,6 +102,9 @@ class TrainConfig:
     """Updates in one compiled call, between two looks at the progress."""
     checkpoint_minutes: float = 2.0
     """Time between two checkpoints."""
+    history: int = 20
+    """Points of the budget, evenly spaced, at which the parameters are kept for the learning curve
+    of `experiments.evaluate --history`; 0 keeps none. A point of TDANet takes 12 MB."""
     max_skipped: int = 20
     """Stop after this many updates that were skipped for a loss or gradient that is not finite."""
     learner: LearnerConfig = dataclasses.field(default_factory=LearnerConfig)
@@ -134,6 +137,8 @@ class TrainConfig:
         for flag, value in positive.items():
             if value is not None and not value > 0:
                 raise ValueError(f"{flag} {value}: must be positive")
+        if self.history < 0:
+            raise ValueError(f"--history {self.history}: must not be negative")
         shares = {
             "--gamma": self.learner.gamma,
             "--gae-lambda": self.learner.gae_lambda,

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tdanet_jax import learner
+from tdanet_jax import history, learner
 from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.learner import TrainState
@@ -99,6 +99,7 @@ class Run:
           ValueError: too many updates were skipped; the state is saved first.
         """
         self._drop_rows_after(int(self.state.updates))
+        history.drop_after(self.folder, int(self.state.updates))
         chunk = self._compile()
         while self.progress < 1.0:
             before = self.progress
@@ -117,6 +118,7 @@ class Run:
             row = self._row(metrics, took)
             with (self.folder / METRICS_FILE).open("a") as file:
                 file.write(json.dumps(row) + "\n")
+            self._keep_point(before)
             yield row
             if row["skipped"] >= self.config.max_skipped:
                 self.save()
@@ -124,6 +126,23 @@ class Run:
                     f"{self.folder}: {row['skipped']} updates skipped because the loss or gradient "
                     "was not finite; the state is saved there"
                 )
+
+    def _keep_point(self, before: float) -> None:
+        """Adds to the history if the budget's share has passed a point since `before`."""
+        point = history.due(before, self.progress, self.config.history)
+        if point:
+            history.write(self.folder, self.snapshot(point))
+
+    def snapshot(self, point: int = 0) -> history.Snapshot:
+        """The network as it is now."""
+        return history.Snapshot(
+            weights=self.state.params,
+            updates=int(self.state.updates),
+            episodes=int(self.state.episodes),
+            seconds=self.seconds,
+            point=point,
+            data_version=self.task.tables.data_version,
+        )
 
     def _compile(self) -> jax.stages.Compiled:
         task, config = self.task, self.config

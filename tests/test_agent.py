@@ -1,15 +1,21 @@
 """A trained agent on its own: what it decides is what the network in the environment decides."""
 
+import json
+import shutil
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import tdanet_jax
-from tdanet_jax import env
+from tdanet_jax import config as configs
+from tdanet_jax import env, history
 from tdanet_jax.agent import Agent, Detection
 from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.history import Snapshot
 from tdanet_jax.models import actor_critic
 from tdanet_jax.reward import find_parents
 from tdanet_jax.task import make_model
@@ -91,3 +97,28 @@ def test_bad_input_is_refused(agent, tmp_path):
         Detection("mug", 120, 80, 160, 130)
     with pytest.raises(ValueError, match="is this the folder of a run"):
         tdanet_jax.load(tmp_path)
+
+
+#: A run of the first version of the software, width 4, and its second decision about two objects.
+OLD_RUN = Path(__file__).parent / "data" / "run_format_1"
+
+
+def test_a_run_of_the_first_version_still_decides_as_it_did(tmp_path):
+    run = shutil.copytree(OLD_RUN, tmp_path / "run")
+    old = tdanet_jax.load(run)
+    seen = [Detection("sink", 0.1, 0.2, 0.4, 0.5), Detection("coffee machine", 0.5, 0.5, 0.75, 1.0)]
+    memory = old.start()
+    for _ in range(2):
+        memory, decision = old.act(memory, seen, "toaster")
+    expected = json.loads((run / "second_decision.json").read_text())
+    np.testing.assert_allclose(decision.probabilities, expected["probabilities"], atol=1e-6)
+    np.testing.assert_allclose(decision.value, expected["value"], atol=1e-6)
+    np.testing.assert_allclose(decision.attention, expected["attention"], atol=1e-5)
+
+
+def test_a_point_of_the_history_is_loaded_by_its_file(weights, glove, tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps(configs.to_json(CONFIG)))
+    path = history.write(tmp_path, Snapshot(weights, 40, 3, 1.0, 1, "any"))
+    loaded = tdanet_jax.load(path)
+    for ours, theirs in zip(jax.tree.leaves(loaded.weights), jax.tree.leaves(weights), strict=True):
+        np.testing.assert_array_equal(ours, theirs)

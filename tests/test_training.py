@@ -3,11 +3,12 @@
 import dataclasses
 import json
 
+import chex
 import jax
 import numpy as np
 import pytest
 
-from tdanet_jax import words
+from tdanet_jax import history, words
 from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.task import make_model, make_task
@@ -16,6 +17,7 @@ from tdanet_jax.training import Run, read_metrics
 #: Eight chunks of two updates of 8 x 5 steps.
 TINY = TrainConfig(
     steps=640,
+    history=8,
     chunk_updates=2,
     learner=LearnerConfig(num_envs=8, rollout_steps=5, step_limit=6),
     network=NetworkConfig(width=16, hidden=16),
@@ -68,6 +70,27 @@ def test_a_stopped_run_goes_on_bit_for_bit(whole, task, tmp_path):
     for ours, theirs in zip(leaves(again.state), leaves(whole[1].state), strict=True):
         np.testing.assert_array_equal(ours, theirs)
     assert without_times(read_metrics(tmp_path)) == without_times(whole[2])
+    assert_same_history(tmp_path, whole[0])
+
+
+def assert_same_history(ours, theirs):
+    names = [[path.name for path in history.points(run)] for run in (ours, theirs)]
+    assert names[0] == names[1]
+    for mine, other in zip(history.points(ours), history.points(theirs), strict=True):
+        mine, other = history.read(mine), history.read(other)
+        for field in ("updates", "episodes", "point", "data_version"):
+            assert getattr(mine, field) == getattr(other, field)
+        chex.assert_trees_all_equal(mine.weights, other.weights)
+
+
+def test_the_history_holds_the_parameters_at_each_point(whole):
+    folder, run, rows = whole
+    kept = [history.read(path) for path in history.points(folder)]
+    # Eight chunks pass the eight points of the budget's eighths.
+    assert [(point.point, point.updates) for point in kept] == [(k, 2 * k) for k in range(1, 9)]
+    assert [point.episodes for point in kept] == [row["episodes"] for row in rows]
+    chex.assert_trees_all_equal(kept[-1].weights, jax.device_get(run.state.params))
+    assert not np.array_equal(*(point.weights["actor"]["kernel"] for point in kept[-2:]))
 
 
 def test_the_weights_of_a_run_are_read_alone(whole):
@@ -96,10 +119,12 @@ def test_the_budget_in_episodes_ends_the_run(task, tmp_path):
     list(run.chunks())
     assert int(run.state.episodes) >= 5
     assert run.steps < 640
+    last = history.read(history.points(tmp_path)[-1])
+    assert (last.point, last.episodes) == (8, int(run.state.episodes))
 
 
 def test_a_run_that_is_no_longer_finite_stops_with_its_state_saved(task, tmp_path):
-    run = Run(tmp_path, dataclasses.replace(TINY, max_skipped=4), task)
+    run = Run(tmp_path, dataclasses.replace(TINY, max_skipped=4, history=0), task)
     broken = jax.tree.map(lambda leaf: leaf * np.nan, run.state.params)
     run.state = run.state.replace(params=broken)
     with pytest.raises(ValueError, match="4 updates skipped") as caught:
@@ -107,6 +132,7 @@ def test_a_run_that_is_no_longer_finite_stops_with_its_state_saved(task, tmp_pat
     assert "\n" not in str(caught.value)
     assert run.steps == 160  # two chunks of two updates, all skipped
     assert Run(tmp_path, TINY, task).steps == 160
+    assert not (tmp_path / "history").exists()  # none was asked for
 
 
 # A read that fails half-way leaves Orbax's own tasks behind, which complain when collected.

@@ -14,7 +14,7 @@ TINY = ["--num-envs", "8", "--rollout-steps", "5", "--width", "16", "--hidden", 
 WRITTEN = {
     "classes.json",
     "config.json", "metrics.jsonl", "checkpoints", "results.json", "results.md", "episodes.jsonl",
-    "learning_curve.png",
+    "learning_curve.png", "history",
 }  # fmt: skip
 
 
@@ -31,6 +31,7 @@ def run(*arguments, cwd=None):
         (["--split", "17/5"], "--split 17/5: choose one of 22/0, 18/4, 14/8"),
         (["--model", "cnn"], "--model cnn: choose one of"),
         (["--steps", "-5"], "--steps -5: must be positive"),
+        (["--history", "-1"], "--history -1: must not be negative"),
         (["--steps", "many"], "invalid literal for int() with base 10: 'many'"),
         (["--stepz", "5"], "Unrecognized options: --stepz, 5"),
         (["--rows", "all"], "invalid choice 'all' for argument '--rows'. Expected one of ('class'"),
@@ -74,6 +75,7 @@ def test_it_trains_evaluates_and_resumes_after_a_signal(ithor, tmp_path):
     assert {p.name for p in out.iterdir()} == WRITTEN
     rows = [json.loads(line) for line in metrics.read_text().splitlines()]
     assert [row["steps"] for row in rows] == list(range(400, 160_001, 400))
+    assert len(list((out / "history").iterdir())) == 20
     results = json.loads((out / "results.json").read_text())
     assert results["split"] == "14/8"
     assert results["seen"]["L>=1"]["n"] == results["unseen"]["L>=1"]["n"] == 1000
