@@ -198,12 +198,11 @@ def load(run: Path | str) -> Agent:
     Raises:
       ValueError: the folder holds no run, or its checkpoint cannot be read.
     """
-    run = Path(run)
-    if run.suffix == history.SUFFIX:
-        config = configs.load(run.parent.parent / CONFIG_FILE)
-        return Agent(config, history.read(run).weights, load_bundled())
-    config = configs.load(run / CONFIG_FILE)
-    if not (run / FOLDER).is_dir():
-        raise ValueError(f"{run / FOLDER}: no checkpoint")
-    classes = vocabularies.load(run)
-    return Agent(config, Checkpoints(run).weights(), load_bundled(), classes)
+    path = Path(run)
+    point = path.suffix == history.SUFFIX
+    folder = path.parent.parent if point else path
+    config = configs.load(folder / CONFIG_FILE)
+    if not point and not (folder / FOLDER).is_dir():
+        raise ValueError(f"{folder / FOLDER}: no checkpoint")
+    weights = history.read(path).weights if point else Checkpoints(folder).weights()
+    return Agent(config, weights, load_bundled(), vocabularies.load(folder))

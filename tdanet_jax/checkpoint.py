@@ -18,6 +18,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from tdanet_jax import assets, files
+from tdanet_jax.history import Snapshot
 from tdanet_jax.learner import TrainState
 
 FORMAT = 1
@@ -85,12 +86,24 @@ class Checkpoints:
         return state.replace(key=jax.random.wrap_key_data(state.key)), meta
 
     def weights(self) -> Any:
-        """The parameters of the newest checkpoint, without knowing anything else of the run.
+        """The parameters of the newest checkpoint; errors as in `snapshot`."""
+        return self.snapshot().weights
+
+    def snapshot(self) -> Snapshot:
+        """The network of the newest checkpoint, without knowing anything else of the run.
 
         Raises:
           ValueError: there is no checkpoint, or none can be read.
         """
-        return self._read(None)[0]["params"]
+        state, meta = self._read(None)
+        return Snapshot(
+            weights=state["params"],
+            updates=int(state["updates"]),
+            episodes=int(state["episodes"]),
+            seconds=float(meta["seconds"]),
+            point=0,
+            data_version=meta["data_version"],
+        )
 
     def _steps(self) -> list[int]:
         """The complete checkpoints, newest first."""
@@ -113,15 +126,20 @@ class Checkpoints:
     def _read_one(self, path: Path, shapes: Any) -> tuple[Any, dict[str, Any]]:
         _verify(path)
         try:
-            restored = self._orbax.restore(
-                path,
-                args=ocp.args.Composite(
-                    state=ocp.args.StandardRestore(shapes), meta=ocp.args.JsonRestore()
-                ),
-            )
+            meta = self._orbax.restore(path, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
+            written = meta["meta"]["format"]
+            if written <= FORMAT:
+                state = self._orbax.restore(
+                    path, args=ocp.args.Composite(state=ocp.args.StandardRestore(shapes))
+                )
         except Exception as error:  # Orbax raises many kinds for a damaged folder
             raise ValueError(f"{path}: unreadable checkpoint ({_reason(error)})") from error
-        return restored["state"], dict(restored["meta"])
+        if written > FORMAT:
+            raise ValueError(
+                f"{path}: checkpoint of format {written}, this version reads up to {FORMAT}: "
+                "a newer tdanet_jax wrote it"
+            )
+        return state["state"], dict(meta["meta"])
 
 
 def _plain(state: TrainState) -> TrainState:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,8 @@ from typing import Any
 import jax
 import numpy as np
 from flax import traverse_util
+
+from tdanet_jax import files
 
 FOLDER = "history"
 SUFFIX = ".npz"
@@ -63,13 +64,8 @@ def write(run: Path, snapshot: Snapshot) -> Path:
     arrays = traverse_util.flatten_dict(jax.device_get(snapshot.weights), sep="/")
     where = {name: getattr(snapshot, name) for name in _WHERE} | {"format": FORMAT}
     content: dict[str, Any] = arrays | {f"@{name}": np.array(v) for name, v in where.items()}
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with fresh.open("wb") as file:
-            np.savez(file, **content)
-        os.replace(fresh, path)
-    finally:
-        fresh.unlink(missing_ok=True)
+    with files.replacing(path) as fresh, fresh.open("wb") as file:
+        np.savez(file, **content)
     return path
 
 
@@ -104,6 +100,7 @@ def points(run: Path) -> list[Path]:
 
 def drop_after(run: Path, updates: int) -> None:
     """Deletes the points behind a checkpoint: their updates will be done again."""
+    files.remove_partial(run / FOLDER)
     for path in points(run):
         if int(path.stem) > updates:
             path.unlink()

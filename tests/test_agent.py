@@ -116,6 +116,14 @@ def test_a_run_of_the_first_version_still_decides_as_it_did(tmp_path):
     np.testing.assert_allclose(decision.attention, expected["attention"], atol=1e-5)
 
 
+def test_a_checkpoint_of_a_newer_version_is_refused_in_one_line(tmp_path):
+    run = shutil.copytree(OLD_RUN, tmp_path / "run")
+    meta = run / "checkpoints" / "2" / "meta" / "metadata"
+    meta.write_text(meta.read_text().replace('"format": 1', '"format": 2'))
+    with pytest.raises(ValueError, match="checkpoint of format 2, this version reads up to 1"):
+        tdanet_jax.load(run)
+
+
 def test_a_point_of_the_history_is_loaded_by_its_file(weights, glove, tmp_path):
     (tmp_path / "config.json").write_text(json.dumps(configs.to_json(CONFIG)))
     path = history.write(tmp_path, Snapshot(weights, 40, 3, 1.0, 1, "any"))
