@@ -87,7 +87,7 @@ class Checkpoints:
 
     def weights(self) -> Any:
         """The parameters of the newest checkpoint; errors as in `snapshot`."""
-        return self.snapshot().weights
+        return self._read(None)[0]["params"]
 
     def snapshot(self) -> Snapshot:
         """The network of the newest checkpoint, without knowing anything else of the run.
