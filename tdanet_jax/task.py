@@ -8,8 +8,9 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from tdanet_jax import env, zero_shot
+from tdanet_jax import env, graph, zero_shot
 from tdanet_jax.classes import Classes, make_classes
 from tdanet_jax.config import MODELS, NetworkConfig, TrainConfig
 from tdanet_jax.env import TEST_STEP_LIMITS, EnvParams
@@ -45,13 +46,28 @@ class Task:
     words: jax.Array
 
 
-def make_task(config: TrainConfig, tables: SceneTables, vectors: WordVectors) -> Task:
-    """The task of a configuration on the given rooms."""
+def make_task(
+    config: TrainConfig,
+    tables: SceneTables,
+    vectors: WordVectors,
+    adjacency: np.ndarray | None = None,
+) -> Task:
+    """The task of a configuration on the given rooms.
+
+    Args:
+      config: the run's configuration.
+      tables: all rooms.
+      vectors: the word vectors.
+      adjacency: [C, C], the class graph of an imported data set; None builds it from the training
+        rooms. Hidden classes are no nodes of either.
+    """
     split = make_split(config.split, config.validation)
-    classes = make_classes(tables.classes, split.hidden)
+    seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
+    if adjacency is None:
+        adjacency = graph.co_occurrence(seen_rooms)
+    classes = make_classes(tables.classes, split.hidden, adjacency)
     model = make_model(config, classes)
     shown = (model.encoder.ROWS or config.network.rows) == "class", model.encoder.IMAGE
-    seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
     parents = find_parents(seen_rooms, split.seen)
     limits = [config.learner.step_limit] * len(ROOM_TYPES)
     words = vectors.table(tables.classes, config.network.word_norm)

@@ -175,6 +175,7 @@ def test_perturbing_all_hidden_data_changes_nothing_that_training_reads(
     other = make_task(config, noisy, other_words(glove, hidden, rooms.classes))
     assert_identical(task.train_params, other.train_params)
     assert_identical(task.train_words, other.train_words)
+    assert task.classes == other.classes
     assert_identical(training_walk(task.train_params), training_walk(other.train_params))
     # The same noise is there for everyone else: evaluation does read it.
     assert_differ(task.eval_params, other.eval_params, "row_box", "visible", "distance")
@@ -218,6 +219,7 @@ def test_perturbing_a_seen_class_is_noticed(rooms: SceneTables, glove: WordVecto
         other = make_task(config, noisy, other_words(glove, names, rooms.classes))
         assert_differ(task.train_params, other.train_params, *fields)
         assert not np.array_equal(task.train_words, other.train_words)
+        assert task.classes.edges != other.classes.edges
 
 
 @pytest.mark.parametrize("split", SPLITS, ids=NAMES)
@@ -237,6 +239,7 @@ def test_no_training_episode_shows_or_asks_for_a_hidden_class(
     assert not np.isin(params.parent_class, indices).any()
     assert not np.isin(params.target_class[params.pair_target], indices).any()
     assert not np.asarray(task.train_words)[indices].any()
+    assert not hidden & {rooms.classes[i] for edge in task.classes.edges for i in edge[:2]}
 
 
 @pytest.mark.parametrize("split", SPLITS, ids=NAMES)
@@ -258,6 +261,7 @@ def test_nothing_of_the_evaluation_rooms_reaches_training(
     alone = make_task(config, rooms.subset(task.split.train_scenes), glove)
     assert_identical(task.train_params, alone.train_params)
     assert_identical(task.train_words, alone.train_words)
+    assert task.classes == alone.classes
 
 
 def test_evaluation_sees_hidden_classes(rooms: SceneTables, glove: WordVectors) -> None:
