@@ -1,4 +1,4 @@
-"""Word vectors: the bundled GloVe 6B vectors, and one vector per class name.
+"""Word vectors: bundled ones of GloVe 6B or those of a file, and one vector per class name.
 
 Bundled are the vectors of the most frequent words of glove.6B.50d (Pennington et al. 2014) and of
 every word in AI2-THOR's class names, in float16, so that any English label has one.
@@ -9,17 +9,19 @@ from __future__ import annotations
 import dataclasses
 import io
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from tdanet_jax import assets
+from tdanet_jax.untrusted import FileError, hdf5, npz
 from tdanet_jax.vocabulary import class_words
 
 ASSET = "words.npz"
 #: How many of the most frequent words the asset holds.
 ASSET_WORDS = 20_000
+LONGEST_LINE = 1 << 16  # bytes of a line of a text file of vectors
 #: Length that every class vector is scaled to. Raw means of GloVe vectors vary from 3 to 7.
 DEFAULT_NORM = 3.0
 
@@ -29,7 +31,7 @@ class WordVectors:
     """A table of word vectors.
 
     Attributes:
-      index: lower-case word -> row.
+      index: lower-case word -> row; a name of several words, joined by spaces, may have its own.
       vectors: [W, D] float32, D the width of a vector.
     """
 
@@ -37,7 +39,7 @@ class WordVectors:
     vectors: np.ndarray
 
     def embed(self, name: str, norm: float = DEFAULT_NORM) -> np.ndarray:
-        """The vector of a class name or label: the mean over its words, scaled to `norm`.
+        """The vector of a class name or label, scaled to `norm`: its own, else its words' mean.
 
         Returns:
           [D] float32 of length `norm`.
@@ -46,15 +48,34 @@ class WordVectors:
           KeyError: a word of the name has no vector; the message names it.
         """
         words = class_words(name)
+        if " ".join(words) in self.index:
+            words = (" ".join(words),)
         missing = [word for word in words if word not in self.index]
         if missing or not words:
             raise KeyError(f"no word vector for {missing or name!r} in the label {name!r}")
         mean = self.vectors[[self.index[word] for word in words]].mean(axis=0, dtype=np.float64)
-        return (norm * mean / np.linalg.norm(mean)).astype(np.float32)
+        return (norm * mean / max(np.linalg.norm(mean), 1e-12)).astype(np.float32)
 
     def table(self, names: Sequence[str], norm: float = DEFAULT_NORM) -> np.ndarray:
-        """One row per name: [len(names), D] float32, each of length `norm`."""
+        """One row per name: [len(names), D] float32, each of length `norm`.
+
+        Raises:
+          ValueError: words have no vector; the message lists them all.
+        """
+        lacking = self.missing(names)
+        if lacking:
+            raise ValueError(f"no word vectors for {', '.join(lacking)}; --word-vectors FILE")
         return np.stack([self.embed(name, norm) for name in names])
+
+    def missing(self, names: Iterable[str]) -> list[str]:
+        """The names that have no vector, each with the words that lack one."""
+        lacking = []
+        for name in names:
+            words = class_words(name)
+            unknown = [word for word in words if word not in self.index]
+            if " ".join(words) not in self.index and (unknown or not words):
+                lacking.append(f"{name} ({', '.join(unknown) or 'no words'})")
+        return lacking
 
 
 def load_bundled() -> WordVectors:
@@ -63,6 +84,91 @@ def load_bundled() -> WordVectors:
         words = bytes(data["words"]).decode("utf-8").split("\n")
         vectors = data["vectors"].astype(np.float32)
     return WordVectors({word: row for row, word in enumerate(words)}, vectors)
+
+
+def load(path: str | Path | None, names: Iterable[str] = ()) -> WordVectors:
+    """The bundled vectors, or those of a file.
+
+    A text file of GloVe (a word and its numbers on each line, most frequent word first), an HDF5
+    file with a dataset per class name (`thor_glove`), or an npz with `words` [W] and `vectors`
+    [W, D]. Of a text file the first 20,000 words are kept, those of the bundled file, and those of
+    `names`.
+
+    Raises:
+      FileError: the file is missing or is none of these.
+    """
+    if path is None:
+        return load_bundled()
+    path = Path(path)
+    if path.suffix in (".hdf5", ".h5"):
+        return _load_hdf5(path)
+    if path.suffix == ".npz":
+        return _load_npz(path)
+    if path.suffix == ".txt":
+        wanted = {word for name in names for word in class_words(name)}
+        return _load_text(path, wanted | load_bundled().index.keys())
+    raise FileError(path, "word vectors are a .txt, .hdf5 or .npz file")
+
+
+def _load_text(path: Path, wanted: Collection[str]) -> WordVectors:
+    index: dict[str, int] = {}
+    rows: list[np.ndarray] = []
+    if not path.is_file():
+        raise FileError(path, "no such file")
+    with path.open("rb") as file:
+        for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b"")):
+            word = line.partition(b" ")[0].decode("utf-8", "replace")
+            if number >= ASSET_WORDS and word not in wanted:
+                continue
+            try:
+                row = np.array(line.split()[1:], np.float32)
+            except ValueError:
+                raise FileError(path, f"line {number + 1} is not a word and its numbers") from None
+            if number == 0 and len(row) == 1:
+                continue  # word2vec's first line: how many words, how wide
+            if len(row) == 0 or (rows and len(row) != len(rows[0])) or not np.isfinite(row).all():
+                raise FileError(path, f"line {number + 1} is not a word and its numbers")
+            if word not in index:
+                index[word] = len(rows)
+                rows.append(row)
+    if not rows:
+        raise FileError(path, "no word vectors")
+    return WordVectors(index, np.stack(rows))
+
+
+def _load_hdf5(path: Path) -> WordVectors:
+    index: dict[str, int] = {}
+    rows: list[np.ndarray] = []
+    with hdf5.opened(path) as reader:
+        for name in reader.names():
+            row = reader.read(name).astype(np.float32)
+            if row.ndim != 1 or len(row) == 0 or (rows and row.shape != rows[0].shape):
+                raise FileError(path, f"{name} is not a vector as wide as the others")
+            if class_words(name):
+                index[" ".join(class_words(name))] = len(rows)
+                rows.append(row)
+    if not rows:
+        raise FileError(path, "no word vectors")
+    return WordVectors(index, np.stack(rows))
+
+
+def _load_npz(path: Path) -> WordVectors:
+    arrays = npz.read(path)
+    if not {"words", "vectors"} <= arrays.keys():
+        raise FileError(path, "no arrays called words and vectors")
+    words, vectors = arrays["words"], arrays["vectors"]
+    if words.dtype == np.uint8:  # as in the bundled file: UTF-8, a word a line
+        names = bytes(words).decode("utf-8", "replace").split("\n")
+    elif words.dtype.kind == "U" and words.ndim == 1:
+        names = words.tolist()
+    else:
+        raise FileError(path, "words is not a list of text")
+    if vectors.dtype.kind != "f" or vectors.ndim != 2 or vectors.shape[0] != len(names):
+        raise FileError(path, "vectors is not a row of numbers for each word")
+    vectors = vectors.astype(np.float32)
+    if vectors.size == 0 or not np.isfinite(vectors).all():
+        raise FileError(path, "vectors is empty or not finite")
+    return WordVectors({word: row for row, word in enumerate(names)}, vectors)
 
 
 def build_asset(wheel: Path, out_dir: Path, names: Iterable[str]) -> Path:

@@ -19,9 +19,3 @@ def write(path: Path, arrays: Mapping[str, np.ndarray], compress: bool = False) 
             entry.external_attr = 0o644 << 16
             method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
             archive.writestr(entry, buffer.getvalue(), compress_type=method, compresslevel=1)
-
-
-def read(path: Path) -> dict[str, np.ndarray]:
-    """All arrays of an npz; object arrays are refused."""
-    with np.load(path, allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}

@@ -21,6 +21,7 @@ from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.geometry import box_frame, frustum_rotation, lattice
 from tdanet_jax.scenes.metadata import parse_scene
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, GRID, REACH, Scene, SceneObject
+from tdanet_jax.untrusted import npz
 from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
 
 ASSET = "ithor.npz"
@@ -146,7 +147,7 @@ def _default_rotation(scene: Scene) -> int:
 
 def load_scenes(path: Path | None = None) -> list[Scene]:
     """The bundled rooms, in the order FloorPlan1-30, 201-230, 301-330, 401-430."""
-    data = archive.read(path or assets.path(ASSET))
+    data = npz.read(path or assets.path(ASSET))
     points = np.split(data["point"] * UNIT, np.cumsum(data["scene_points"])[:-1])
     parents = np.split(data["parent"], np.cumsum(data["object_parents"])[:-1])
     ids = [value.decode() for value in data["object_id"]]

@@ -8,7 +8,7 @@ apart, clockwise from +z, horizon 0 looks level and 1 looks 30 degrees down.
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
@@ -28,6 +28,7 @@ from tdanet_jax.scenes.raster import paint
 from tdanet_jax.scenes.rules import RULES, Rules
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene
 from tdanet_jax.scenes.visibility import IMAGE, SUBPIXEL, Sight, look_around
+from tdanet_jax.untrusted import npz
 from tdanet_jax.vocabulary import ALL_TARGETS
 
 FIELD_OF_VIEW = 90.0
@@ -49,7 +50,8 @@ class SceneTables:
     next_position: np.ndarray  # [P, 8] int32, where MoveAhead leads; itself when blocked
     row_start: np.ndarray  # [S + 1] int32, rows of state s are row_start[s]:row_start[s + 1]
     row_object: np.ndarray  # [N] int32, index of the object; by (class, object) in a state
-    row_box: np.ndarray  # [N, 4] int16, x1, y1, x2, y2 in sixteenths of a pixel, y down
+    row_box: np.ndarray  # [N, 4] int16, x1, y1, x2, y2 in sixteenths of a pixel, y down;
+    # all -1 where an object is known to be visible, but not where (imported data alone)
     row_visible: np.ndarray  # [N] bool, visible as AI2-THOR says it: within 1.5 m horizontally
     object_class: np.ndarray  # [O] int16
     object_scene: np.ndarray  # [O] int16
@@ -141,6 +143,15 @@ class SceneTables:
 
     def save(self, path: Path) -> None:
         """Write the tables as a compressed npz without pickles."""
+        archive.write(path, self.to_arrays(), compress=True)
+
+    @classmethod
+    def load(cls, path: Path) -> "SceneTables":
+        """Read what `save` wrote."""
+        return cls.from_arrays(npz.read(path))
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """All fields as named arrays; what is no array goes into `rest`, as JSON."""
         arrays: dict[str, np.ndarray] = {}
         rest: dict[str, object] = {}
         for field in dataclasses.fields(self):
@@ -150,17 +161,17 @@ class SceneTables:
             else:
                 rest[field.name] = value
         arrays["rest"] = np.frombuffer(json.dumps(rest).encode(), np.uint8)
-        archive.write(path, arrays, compress=True)
+        return arrays
 
     @classmethod
-    def load(cls, path: Path) -> "SceneTables":
-        """Read what `save` wrote."""
-        arrays: dict[str, Any] = dict(archive.read(path))
-        rest = json.loads(arrays.pop("rest").tobytes())
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "SceneTables":
+        """What `to_arrays` gave; further arrays, under names with a slash, are left out."""
+        own: dict[str, Any] = {name: a for name, a in arrays.items() if "/" not in name}
+        rest = json.loads(own.pop("rest").tobytes())
         fields: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in rest.items()
         }
-        return cls(**arrays, **fields)
+        return cls(**own, **fields)
 
 
 def _ends(counts: np.ndarray) -> np.ndarray:
@@ -168,7 +179,7 @@ def _ends(counts: np.ndarray) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Room:
+class Room:
     """One room's share of the tables, indices counted from the room's own first entry."""
 
     next_position: np.ndarray
@@ -197,7 +208,7 @@ def build(
         else classes
     )
 
-    def work(scene: Scene) -> _Room:
+    def work(scene: Scene) -> Room:
         return _build_room(scene, names, targets, rules)
 
     rooms = []
@@ -206,41 +217,58 @@ def build(
             rooms.append(room)
             if progress is not None:
                 progress(len(rooms), len(scenes))
-    return _join(scenes, rooms, names, tuple(targets))
+    return join(scenes, rooms, names, tuple(targets))
 
 
 def _build_room(
     scene: Scene, classes: tuple[str, ...], targets: Sequence[str], rules: Rules
-) -> _Room:
-    index = {name: i for i, name in enumerate(classes)}
+) -> Room:
+    known = set(classes)
     for item in scene.objects:
-        if item.object_class not in index:
+        if item.object_class not in known:
             raise SceneError(
                 f"{scene.name}: {item.object_id}: class {item.object_class} is not known"
             )
+    sight, steps = look_around(scene, rules), next_positions(scene.points)
+    return tabulate(scene, steps, sight, classes, targets)
+
+
+def tabulate(
+    scene: Scene,
+    next_position: np.ndarray,
+    sight: Sight,
+    classes: tuple[str, ...],
+    targets: Sequence[str],
+) -> Room:
+    """One room's share of the tables.
+
+    Args:
+        next_position: [P, 8] where MoveAhead leads. sight: what is seen from each state.
+        classes: the vocabulary, with all classes of the room; at most 127.
+    """
+    index = {name: i for i, name in enumerate(classes)}
     object_class = np.array([index[item.object_class] for item in scene.objects], np.int16)
-    sight = look_around(scene, rules)
     states = len(scene.points) * VIEWS
     goals = np.zeros((states, len(targets)), bool)
     for g, target in enumerate(targets):
         seen = sight.visible & (object_class[sight.owner] == index.get(target, -1))
         goals[sight.state[seen], g] = True
-    steps = next_positions(scene.points)
-    return _Room(
-        next_position=steps,
+    return Room(
+        next_position=next_position,
         sight=sight,
         object_class=object_class,
-        distance=action_distances(transitions(steps), goals),
+        distance=action_distances(transitions(next_position), goals),
         raster=paint(sight.state, sight.box, object_class[sight.owner], states, IMAGE * SUBPIXEL),
     )
 
 
-def _join(
+def join(
     scenes: Sequence[Scene],
-    rooms: Sequence[_Room],
+    rooms: Sequence[Room],
     classes: tuple[str, ...],
     targets: tuple[str, ...],
 ) -> SceneTables:
+    """The tables of all rooms, one after the other, from each room's share."""
     points = [len(scene.points) for scene in scenes]
     objects = [len(scene.objects) for scene in scenes]
     first_point = np.concatenate([[0], np.cumsum(points)])

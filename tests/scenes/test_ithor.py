@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from tdanet_jax import assets, bundle
-from tdanet_jax.scenes import SceneError, archive, geometry, ithor, metadata
+from tdanet_jax.scenes import SceneError, geometry, ithor, metadata
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, REACH
+from tdanet_jax.untrusted import npz
 from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
 
 WHEELS = os.environ.get("TDANET_WHEELS")  # folder with the wheels of bundle.SOURCES
@@ -149,7 +150,7 @@ def test_flagged_objects_lie_in_the_default_view() -> None:
 
 
 def test_no_pickles_in_the_asset() -> None:
-    for array in archive.read(assets.path(ithor.ASSET)).values():
+    for array in npz.read(assets.path(ithor.ASSET)).values():
         assert array.dtype != object
 
 

@@ -1,0 +1,1 @@
+"""The original offline data (the layout of SAVN, MJOLNIR and SSNet), in and out."""

@@ -1,0 +1,176 @@
+"""Tables as a folder in the original layout, for code that reads it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tdanet_jax.scenes.geometry import transitions
+from tdanet_jax.scenes.offline.importer import Report
+from tdanet_jax.scenes.offline.layout import (
+    BOX_FILE,
+    FEATURE_FILE,
+    FEATURE_SHAPE,
+    GRAPH_FILE,
+    GRID_FILE,
+    OBJECT_FILE,
+    PARENT_FILE,
+    ROOM_NAMES,
+    VISIBILITY_FILES,
+    state_keys,
+)
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.untrusted import FileError
+from tdanet_jax.vocabulary import ROOM_TYPES
+
+Parents = Mapping[str, Mapping[str, Mapping[str, float]]]
+
+
+def write_folder(
+    tables: SceneTables,
+    out: Path,
+    report: Report,
+    parents: Parents | None = None,
+    vectors: np.ndarray | None = None,
+    features: bool = False,
+) -> None:
+    """Writes a folder with one folder a scene; it appears whole or not at all.
+
+    Args:
+        out: must not exist.
+        report: called with the share done and the name of each scene.
+        parents: room type -> target -> parent -> R_p, for `c2p_prob.json`.
+        vectors: [C, D] one vector per class, for `thor_glove/glove_map<D>d.hdf5`.
+        features: also write `resnet18_featuremap.hdf5`: channel c of a map is 1 in the cells of the
+            7 x 7 raster that show class c of `tables.classes`, 0 elsewhere.
+    """
+    if vectors is not None or features:
+        _need_h5py(out)
+    fresh = out.with_name(f".{out.name}.{os.getpid()}")
+    try:
+        fresh.mkdir(parents=True)
+        for i, name in enumerate(tables.scenes):
+            room = tables.subset([name])
+            folder = fresh / name
+            folder.mkdir()
+            write_scene(room, folder)
+            if features:
+                write_features(room, folder / FEATURE_FILE)
+            report((i + 1) / len(tables.scenes), name)
+        if parents:
+            titled = {ROOM_NAMES[ROOM_TYPES.index(r)]: targets for r, targets in parents.items()}
+            _write(fresh / PARENT_FILE, titled)
+        if vectors is not None:
+            write_vectors(tables.classes, vectors, fresh / "thor_glove")
+        os.replace(fresh, out)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+
+
+def write_scene(room: SceneTables, folder: Path) -> None:
+    """Writes grid, graph, visibility map (under both of its names), boxes and objects of a room."""
+    keys = state_keys(room.position)
+    _write(folder / GRID_FILE, [dict(zip("xyz", point, strict=True)) for point in
+                                room.position.tolist()])  # fmt: skip
+    _write(folder / GRAPH_FILE, graph(room, keys))
+    for name in VISIBILITY_FILES[:2]:
+        _write(folder / name, visible_from(room, keys))
+    _write(folder / BOX_FILE, boxes(room, keys))
+    _write(folder / OBJECT_FILE, objects(room, keys))
+
+
+def graph(room: SceneTables, keys: Sequence[str]) -> dict[str, Any]:
+    """networkx's node-link form of the moves: a link per state and action that changes it."""
+    successor = transitions(room.next_position)
+    links = [
+        {"source": keys[state], "target": keys[to]}
+        for state in range(len(keys))
+        for to in dict.fromkeys(successor[state].tolist())
+        if to != state
+    ]
+    return {
+        "directed": True,
+        "multigraph": False,
+        "graph": {},
+        "nodes": [{"id": key} for key in keys],
+        "links": links,
+    }
+
+
+def visible_from(room: SceneTables, keys: Sequence[str]) -> dict[str, list[str]]:
+    """Object id -> states. Objects that are visible from nowhere are not listed: the reference
+    draws its targets among all that are."""
+    rows = np.flatnonzero(room.row_visible)
+    rows = rows[np.argsort(room.row_object[rows], kind="stable")]
+    result: dict[str, list[str]] = {}
+    for item, state in zip(room.row_object[rows].tolist(), room.row_state[rows].tolist(),
+                           strict=True):  # fmt: skip
+        result.setdefault(room.object_id[item], []).append(keys[state])
+    return result
+
+
+def boxes(room: SceneTables, keys: Sequence[str]) -> dict[str, dict[str, list[float]]]:
+    """State -> class -> x1, y1, x2, y2 of each instance, pixels."""
+    result: dict[str, dict[str, list[float]]] = {key: {} for key in keys}
+    rows = np.flatnonzero(room.row_box[:, 0] >= 0)
+    pixels = (room.row_box[rows] / room.subpixel).tolist()
+    states, kinds = room.row_state[rows].tolist(), room.row_class[rows].tolist()
+    for state, kind, box in zip(states, kinds, pixels, strict=True):
+        result[keys[state]].setdefault(room.classes[kind], []).extend(box)
+    return result
+
+
+def objects(room: SceneTables, keys: Sequence[str]) -> dict[str, Any]:
+    """What the original layout leaves out: every object's class and box (metres), and whose each
+    box of `objects_bb.json` is, as places in the list of objects."""
+    rows = np.flatnonzero(room.row_box[:, 0] >= 0)
+    instances: dict[str, list[int]] = {key: [] for key in keys}
+    for state, item in zip(room.row_state[rows].tolist(), room.row_object[rows].tolist(),
+                           strict=True):  # fmt: skip
+        instances[keys[state]].append(item)
+    records = {
+        name: {
+            "objectType": room.classes[room.object_class[i]],
+            "box": None if np.isnan(room.object_box[i]).any() else room.object_box[i].tolist(),
+        }
+        for i, name in enumerate(room.object_id)
+    }
+    return {"objects": records, "instances": instances}
+
+
+def write_features(room: SceneTables, path: Path) -> None:
+    """One-hot class rasters as feature maps [512, 7, 7], a dataset per state."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for key, raster in zip(state_keys(room.position), room.raster, strict=True):
+            channel = np.arange(FEATURE_SHAPE[0])[:, None, None]
+            values = (raster[None] == channel).astype(np.float32)
+            file.create_dataset(key, data=values, compression="gzip", compression_opts=1)
+
+
+def write_vectors(classes: Sequence[str], vectors: np.ndarray, folder: Path) -> None:
+    """A dataset per class name, as `thor_glove` holds them."""
+    import h5py
+
+    folder.mkdir()
+    with h5py.File(folder / f"glove_map{vectors.shape[1]}d.hdf5", "w") as file:
+        for name, vector in zip(classes, vectors, strict=True):
+            file.create_dataset(name, data=vector.astype(np.float32))
+
+
+def _need_h5py(out: Path) -> None:
+    try:
+        import h5py  # noqa: F401
+    except ImportError:
+        raise FileError(out, "needs h5py: pip install 'tdanet-jax[offline]'") from None
+
+
+def _write(path: Path, content: Any) -> None:
+    path.write_text(json.dumps(content, separators=(",", ":")), encoding="utf-8")

@@ -1,0 +1,152 @@
+"""What lies beside the scenes in the original data: parents, class graph, test episodes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
+from tdanet_jax.scenes.offline.layout import PARENT_FILE, ROOM_NAMES, Grid, scene_of
+from tdanet_jax.untrusted import FileError, jsons, pickles
+from tdanet_jax.vocabulary import ROOM_TYPES
+
+MOST_EPISODES, MOST_CLASSES = 100_000, 2_000
+LARGEST_REWARD = 100.0
+EPISODE_FOLDER, GRAPH_FOLDER = "test_val_split", "gcn"
+GRAPH_CLASSES, GRAPH_MATRIX = "objects.txt", "adjmat.dat"
+
+
+def read_extras(folders: Iterable[Path], grids: Mapping[str, Grid]) -> tuple[Extras, list[str]]:
+    """What the first folder that has it holds of each kind, and a line for each.
+
+    Args:
+        grids: the imported scenes; episodes in others are left out.
+
+    Raises:
+        FileError: a file is broken; names file and reason.
+    """
+    places = list(folders)
+    parents, adjacency = _first(places, PARENT_FILE), _first(places, GRAPH_FOLDER)
+    published = _first(places, EPISODE_FOLDER)
+    extras, lines = Extras(), []
+    if parents is not None:
+        extras = dataclasses.replace(extras, parents=read_parents(parents))
+        count = sum(len(targets) for targets in extras.parents.values())
+        lines.append(f"{parents}: parents of {count} targets")
+    if adjacency is not None:
+        names, matrix = read_graph(adjacency / GRAPH_CLASSES, adjacency / GRAPH_MATRIX)
+        extras = dataclasses.replace(extras, graph_classes=names, adjacency=matrix)
+        lines.append(f"{adjacency}: a graph of {len(names)} classes")
+    if published is not None:
+        episodes: list[PublishedEpisode] = []
+        left = 0
+        for path in sorted(published.glob("*_*.pkl")):
+            kept, others = read_episodes(path, grids)
+            episodes, left = episodes + kept, left + others
+        extras = dataclasses.replace(extras, episodes=tuple(episodes))
+        rest = f"; {left} in scenes that were not imported" if left else ""
+        lines.append(f"{published}: {len(episodes)} episodes{rest}")
+    return extras, lines
+
+
+def _first(folders: list[Path], name: str) -> Path | None:
+    return next((folder / name for folder in folders if (folder / name).exists()), None)
+
+
+def read_parents(path: Path) -> dict[str, dict[str, dict[str, float]]]:
+    """Room type -> target -> parent -> R_p, of `c2p_prob.json`.
+
+    Raises:
+        FileError: it is not of this shape, or a reward is not between 0 and 100.
+    """
+    result: dict[str, dict[str, dict[str, float]]] = {}
+    for title, targets in jsons.members(path):
+        if title not in ROOM_NAMES:
+            raise FileError(path, f"room {title!r} is not one of {', '.join(ROOM_NAMES)}")
+        if not isinstance(targets, Mapping):
+            raise FileError(path, f"{title}: no targets")
+        room = result[ROOM_TYPES[ROOM_NAMES.index(title)]] = {}
+        for target, parents in targets.items():
+            if not isinstance(parents, Mapping):
+                raise FileError(path, f"{title}: {target}: no parents")
+            room[target] = {
+                name: jsons.number(path, value, f"{target}: {name}", LARGEST_REWARD)
+                for name, value in parents.items()
+            }
+            if any(reward < 0 for reward in room[target].values()):
+                raise FileError(path, f"{target}: a reward below 0")
+    return result
+
+
+def read_graph(names_path: Path, matrix_path: Path) -> tuple[tuple[str, ...], np.ndarray]:
+    """The class graph: n names and the adjacency [n, n] float32.
+
+    Raises:
+        FileError: a file is missing or broken, or they do not match.
+    """
+    for path in (names_path, matrix_path):
+        if not path.is_file() or path.stat().st_size > pickles.LARGEST_FILE:
+            raise FileError(path, "no such file, or too large")
+    text = names_path.read_text(encoding="utf-8", errors="replace")
+    names = tuple(line.strip() for line in text.splitlines() if line.strip())
+    if not 0 < len(names) <= MOST_CLASSES or len(set(names)) != len(names):
+        raise FileError(names_path, "not a list of different class names")
+    value = pickles.load_torch(matrix_path.read_bytes(), matrix_path)
+    matrix = pickles.array(value, matrix_path)
+    if matrix.shape != (len(names), len(names)):
+        raise FileError(matrix_path, f"shape {matrix.shape} is not that of {len(names)} classes")
+    plain = matrix.astype(np.float32)
+    if not np.isfinite(plain).all():
+        raise FileError(matrix_path, "holds NaN or infinity")
+    return names, plain
+
+
+def read_episodes(path: Path, grids: Mapping[str, Grid]) -> tuple[list[PublishedEpisode], int]:
+    """The episodes of `<room>_<test|val>.pkl` in known scenes, and how many are in others.
+
+    Raises:
+        FileError: it is not a list of episodes, or a start is not on its scene's grid.
+    """
+    part = path.stem.rpartition("_")[2]
+    if part not in ("test", "val") or path.stat().st_size > pickles.LARGEST_FILE:
+        raise FileError(path, "not named <room>_test.pkl or <room>_val.pkl, or too large")
+    records = pickles.load(path.read_bytes(), path)
+    if not isinstance(records, list) or len(records) > MOST_EPISODES:
+        raise FileError(path, "not a list of episodes")
+    found, others = [], 0
+    for episode in _episodes(path, records, part):
+        if episode.scene in grids:
+            grid = grids[episode.scene]
+            grid.find(path, episode.x, episode.z, episode.rotation, episode.horizon)
+            found.append(episode)
+        else:
+            others += 1
+    return found, others
+
+
+def _episodes(path: Path, records: list[Any], part: str) -> Iterator[PublishedEpisode]:
+    for i, record in enumerate(records):
+        where = f"episode {i}"
+        if not isinstance(record, dict) or not {"scene", "state", "goal_object_type"} <= set(
+            record
+        ):
+            raise FileError(path, f"{where}: no scene, state and goal_object_type")
+        scene, target = record["scene"], record["goal_object_type"]
+        known = scene_of(scene) if isinstance(scene, str) else None
+        if known is None or not isinstance(target, str):
+            raise FileError(path, f"{where}: {scene!r:.40} is not an iTHOR scene, or no target")
+        if "glove_embedding" in record:  # decoded to be sure of it; the vectors come with a file
+            pickles.array(record["glove_embedding"], path)
+        state = record["state"]
+        fields = state.state if isinstance(state, pickles.Call) else None
+        if not isinstance(fields, dict) or not state.name.endswith(pickles.AGENT_STATE):
+            raise FileError(path, f"{where}: its state is no {pickles.AGENT_STATE}")
+        x, z, rotation, horizon = (
+            jsons.number(path, fields.get(name), f"{where}: {name}", 1000.0)
+            for name in ("x", "z", "rotation", "horizon")
+        )
+        yield PublishedEpisode(part, known[0], x, z, round(rotation), round(horizon), target)

@@ -1,0 +1,108 @@
+"""Names of files and states in the original offline data. docs/data.md describes them all."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tdanet_jax.scenes.geometry import HEADINGS, HORIZONS
+from tdanet_jax.scenes.metadata import ALIGNED
+from tdanet_jax.scenes.scene import GRID
+from tdanet_jax.untrusted import FileError
+from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
+
+GRID_FILE, GRAPH_FILE, BOX_FILE = "grid.json", "graph.json", "objects_bb.json"
+#: Both names of the visibility map, the one that says its distance first; then the raw metadata.
+VISIBILITY_FILES = ("visible_object_map_1.5.json", "visible_object_map.json", "metadata.json")
+#: Not part of the original layout: what it leaves out of our tables (see docs/data.md).
+OBJECT_FILE = "objects.json"
+FEATURE_FILE = "resnet18_featuremap.hdf5"
+FEATURE_SHAPE = (512, 7, 7)
+PARENT_FILE = "c2p_prob.json"
+#: Names of the room types in `c2p_prob.json`, in the order of `ROOM_TYPES`.
+ROOM_NAMES = ("Kitchen", "Living_Room", "Bedroom", "Bathroom")
+
+_SCENE = re.compile(r"FloorPlan(\d{1,4})(_physics)?")
+_NUMBER = r"(-?\d{1,4}(?:\.\d{1,9})?)"
+_KEY = re.compile(rf"{_NUMBER}\|{_NUMBER}\|(\d{{1,3}})(?:\.0)?\|(\d{{1,2}})(?:\.0)?")
+
+
+def scene_of(name: str) -> tuple[str, int] | None:
+    """Name and room type of an iTHOR scene, written with or without "_physics", or None."""
+    match = _SCENE.fullmatch(name)
+    if match is None:
+        return None
+    number = int(match[1])
+    for room_type, room in enumerate(ROOM_TYPES):
+        if number in SCENE_NUMBERS[room]:
+            return f"FloorPlan{number}", room_type
+    return None
+
+
+def state_key(x: float, z: float, rotation: int, horizon: int) -> str:
+    """A state's key as the reference controller writes it: "-0.00|1.25|45|30".
+
+    Metres are rounded first and written then, so that -0.001 and -0.0 give "-0.00".
+    """
+    return f"{round(x, 2):0.2f}|{round(z, 2):0.2f}|{rotation:d}|{horizon:d}"
+
+
+def state_keys(points: np.ndarray) -> list[str]:
+    """Keys of all states of points [P, 3], in the order of the tables: P * 16."""
+    return [
+        state_key(float(x), float(z), 45 * heading, 30 * horizon)
+        for x, _, z in points
+        for heading in range(HEADINGS)
+        for horizon in range(HORIZONS)
+    ]
+
+
+class Grid:
+    """The reachable points of a scene, and the states that keys name."""
+
+    def __init__(self, points: np.ndarray) -> None:
+        self.points = points  # [P, 3] metres
+        self._origin = points[0, [0, 2]]
+        cells = np.rint((points[:, [0, 2]] - self._origin) / GRID).astype(np.int64)
+        self._index = {(int(x), int(z)): i for i, (x, z) in enumerate(cells)}
+        self._known: dict[str, int] = {}
+
+    def state(self, path: Path | str, key: object) -> int:
+        """The state that a key names; "-0.00" and "0.00" are one place.
+
+        Raises:
+            FileError: it is no key, or its point is not on the grid.
+        """
+        if not isinstance(key, str):
+            raise FileError(path, "a state key that is no text")
+        if key not in self._known:
+            self._known[key] = self._find(path, key)
+        return self._known[key]
+
+    def _find(self, path: Path | str, key: str) -> int:
+        match = _KEY.fullmatch(key)
+        if match is None:
+            raise FileError(path, f"state key {key!r} is not x|z|rotation|horizon")
+        return self.find(path, float(match[1]), float(match[2]), int(match[3]), int(match[4]))
+
+    def find(self, path: Path | str, x: float, z: float, rotation: int, horizon: int) -> int:
+        """The state at a place in metres, with a rotation and a horizon in degrees.
+
+        Raises:
+            FileError: there is none.
+        """
+        key = state_key(x, z, rotation, horizon)
+        if rotation % 45 or not 0 <= rotation < 360 or horizon not in (0, 30):
+            raise FileError(path, f"state {key}: rotation or horizon is not one of the task's")
+        steps = (np.array([x, z]) - self._origin) / GRID
+        cell = np.rint(steps)
+        point = self._index.get((int(cell[0]), int(cell[1])))
+        if point is None or np.abs(steps - cell).max() * GRID > ALIGNED:
+            raise FileError(path, f"state {key} is not on the grid of grid.json")
+        return (point * HEADINGS + rotation // 45) * HORIZONS + horizon // 30
+
+
+def first_file(folder: Path, names: Sequence[str]) -> Path | None:
+    """The first of `names` that is a file in `folder`."""
+    return next((folder / name for name in names if (folder / name).is_file()), None)
