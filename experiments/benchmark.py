@@ -54,6 +54,8 @@ class Command:
     """Numbers of environments in the `update` part."""
     precisions: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
     """Operands of the products in the `update` part."""
+    data: str | None = None
+    """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
     repeats: int = 5
     """Timed repetitions of each figure."""
     out: Path | None = None
@@ -81,8 +83,7 @@ def measure(command: Command) -> Iterator[Row]:
     """All figures that were asked for, one row each."""
     import jax
 
-    from tdanet_jax import scenes, words
-    from tdanet_jax.task import make_task
+    from tdanet_jax.task import load_task
 
     yield {
         "part": "start",
@@ -92,8 +93,7 @@ def measure(command: Command) -> Iterator[Row]:
     }
     if "tables" in command.parts:
         yield tables_row()
-    tables = scenes.load_tables()
-    task = make_task(TrainConfig(), tables, words.load_bundled())
+    task = load_task(TrainConfig(data=command.data))
     peak = None
     if "machine" in command.parts:
         machine = machine_row(command.repeats)
@@ -108,7 +108,7 @@ def measure(command: Command) -> Iterator[Row]:
             for count in command.batches:
                 yield update_row(task, precision, count, peak, command.repeats)
     if "evaluation" in command.parts:
-        yield evaluation_row(task, tables, command.repeats)
+        yield evaluation_row(task, command.repeats)
     if "decision" in command.parts:
         for count in (1, 1024):
             yield decision_row(task, count, command.repeats)
@@ -282,7 +282,7 @@ def update_row(task: Task, precision: str, count: int, peak: float | None, repea
     }
 
 
-def evaluation_row(task: Task, tables: Any, repeats: int) -> Row:
+def evaluation_row(task: Task, repeats: int) -> Row:
     """All episodes of a split, sampled actions of an untrained network (the longest case)."""
     import jax
 
@@ -291,7 +291,7 @@ def evaluation_row(task: Task, tables: Any, repeats: int) -> Row:
     model = task.model
     weights = model.initialise(jax.random.key(0), task.words)
     policy = policies.network(model, task.words)
-    lists = episodes.load(tables, task.split)
+    lists = episodes.load(task.tables, task.split, task.extras)
 
     def call() -> Any:
         played = evaluation.evaluate_lists(policy, weights, task.eval_params, lists, 0)

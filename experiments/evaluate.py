@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from experiments.console import console, fail, one_line_errors, parse, print_summary
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
+
+if TYPE_CHECKING:
+    from tdanet_jax.task import Task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +31,9 @@ class Command:
     checkpoint; the latter knows the way."""
     split: str = "18/4"
     """Split of the policies that need no checkpoint."""
+    data: str | None = None
+    """File of rooms that `experiments.scenes import` wrote, in place of those of the run, or of the
+    bundled ones."""
     seed: int = 0
     """Seed of sampled actions."""
     out: Path | None = None
@@ -44,10 +50,12 @@ def main(arguments: list[str] | None = None) -> None:
         if not trained and command.checkpoint is not None:
             fail(f"--policy {command.policy} takes no --checkpoint")
         if command.checkpoint is None:
-            config = TrainConfig(split=command.split)
+            config = TrainConfig(split=command.split, data=command.data)
             config.check()
         else:
             config = configs.load(command.checkpoint / CONFIG_FILE)
+            if command.data is not None:
+                config = dataclasses.replace(config, data=command.data)
         folder = command.out or (command.checkpoint or Path("runs")) / command.policy
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             fail(f"--out {folder}: exists and is not empty")
@@ -56,20 +64,21 @@ def main(arguments: list[str] | None = None) -> None:
 
 def evaluate(command: Command, config: TrainConfig, folder: Path) -> None:
     """Plays the episodes and writes the results."""
-    from tdanet_jax import episodes, evaluation, policies, report, scenes, words
-    from tdanet_jax.task import make_task
+    from tdanet_jax import episodes, evaluation, policies, report
+    from tdanet_jax.task import load_task
     from tdanet_jax.training import Run
 
-    tables = scenes.load_tables()
-    task = make_task(config, tables, words.load_bundled())
-    lists = episodes.load(tables, task.split)
+    task = load_task(config)
+    tables = task.tables
+    lists = episodes.load(tables, task.split, task.extras)
     weights, trained, steps = None, 0, 0
     if command.checkpoint is None:
         policy = {"random": policies.random, "shortest_path": policies.shortest_path}[
             command.policy
         ]()
     else:
-        run = Run(command.checkpoint, config, task)
+        check_vocabulary(command.checkpoint, config, task)
+        run = Run(command.checkpoint, config, task, other_rooms=command.data is not None)
         if run.fresh:
             fail(f"{command.checkpoint}: no checkpoint")
         policy = policies.network(run.model, task.words, greedy=command.policy == "greedy")
@@ -83,10 +92,21 @@ def evaluate(command: Command, config: TrainConfig, folder: Path) -> None:
         seed=config.seed if weights is not None else command.seed,
         steps=steps,
         data_version=tables.data_version,
+        data=config.data,
     )
     folder.mkdir(parents=True, exist_ok=True)
     print_summary(report.write(folder, provenance, tables, played))
     console.print(f"wrote {folder / 'results.md'}")
+
+
+def check_vocabulary(run: Path, config: TrainConfig, task: Task) -> None:
+    """Ends the program if a model that numbers its classes is to see rooms with others."""
+    from tdanet_jax import classes
+
+    names = classes.load(run).names
+    numbered = task.model.encoder.ROWS == "class" or task.model.encoder.IMAGE
+    if numbered and names and names != task.tables.classes:
+        fail(f"--data {config.data}: {config.model} knows the classes of {run} alone, in number")
 
 
 if __name__ == "__main__":

@@ -2,18 +2,19 @@
 
 python -m experiments.scenes verify
 python -m experiments.scenes inspect FloorPlan228
-python -m experiments.scenes import my_rooms.json --out my_tables.npz
+python -m experiments.scenes import my_rooms.json --out my_rooms.npz
+python -m experiments.scenes import --from thor_v1_offline_data --out original.npz
+python -m experiments.scenes export --out our_rooms
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
-import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -23,7 +24,7 @@ from tdanet_jax.scenes.scene import GRID
 from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TRAIN_SCENES_PER_TYPE
 
 if TYPE_CHECKING:
-    from tdanet_jax.scenes import SceneTables
+    from tdanet_jax.scenes import SceneTables, dataset
     from tdanet_jax.scenes.scene import Scene
 
 
@@ -173,20 +174,16 @@ class Inspect:
     """0 or 30 degrees down; with --position."""
     scenes: Path | None = None
     """Scene file (JSON) that holds the room; by default the bundled rooms."""
+    data: str | None = None
+    """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
     out: Path = Path("scene.png")
     """Picture to write."""
 
     def run(self) -> None:
         """Writes the picture and lists the view."""
-        from tdanet_jax.scenes import ithor, metadata, picture
-        from tdanet_jax.scenes import tables as scene_tables
+        from tdanet_jax.scenes import picture
 
-        rooms = ithor.load_scenes() if self.scenes is None else metadata.read_scenes(self.scenes)
-        names = [room.name for room in rooms]
-        if self.scene not in names:
-            fail(f"{self.scene}: no such room; there are {names[0]} to {names[-1]}")
-        room = rooms[names.index(self.scene)]
-        tables = scene_tables.build([room])
+        room, tables = self._room()
         if self.position is None:
             state = picture.most_telling_state(tables)
         else:
@@ -194,36 +191,144 @@ class Inspect:
         picture.draw(room, tables, state, self.out)
         console.print(f"{self.out}")
 
+    def _room(self) -> tuple[Scene, SceneTables]:
+        """The room and its tables."""
+        from tdanet_jax.scenes import dataset, ithor, metadata
+        from tdanet_jax.scenes import tables as scene_tables
+
+        if self.data is not None:
+            if self.scenes is not None:
+                fail("--scenes and --data: choose one")
+            tables = dataset.load_rooms(self.data).tables
+            self._check(tables.scenes)
+            tables = tables.subset([self.scene])
+            return dataset.as_scene(tables), tables
+        rooms = ithor.load_scenes() if self.scenes is None else metadata.read_scenes(self.scenes)
+        names = [room.name for room in rooms]
+        self._check(names)
+        room = rooms[names.index(self.scene)]
+        return room, scene_tables.build([room])
+
+    def _check(self, names: Sequence[str]) -> None:
+        if self.scene not in names:
+            fail(f"{self.scene}: no such room; there are {names[0]} to {names[-1]}")
+
 
 @dataclasses.dataclass(frozen=True)
 class Import:
-    """Turns a scene file (JSON of AI2-THOR metadata, see docs/scenes.md) into tables."""
+    """Makes a file of rooms, for --data, from AI2-THOR metadata or from the original offline data.
 
-    scenes: tyro.conf.Positional[Path]
+    Either a scene file (JSON, see docs/scenes.md) or, with --from, a folder of FloorPlan* as SAVN,
+    MJOLNIR and SSNet use it (see docs/data.md).
+    """
+
+    scenes: tyro.conf.Positional[Path | None] = None
     """Scene file."""
+    source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    """Folder that holds the folders FloorPlan*; files beside them (parents, class graph, test
+    episodes) are taken along. An import that was stopped goes on where it was."""
     out: Path = Path("tables.npz")
-    """Tables to write; must not exist."""
+    """File to write; must not exist."""
+    features: bool = False
+    """With --from: also copy the scenes' resnet18_featuremap.hdf5 into one memory-mapped file
+    beside --out, half precision, 50 kB a state (12 GB for all rooms)."""
 
     def run(self) -> None:
-        """Writes the tables and says what in them is out of reach."""
-        from tdanet_jax.scenes import metadata
-        from tdanet_jax.scenes import tables as scene_tables
+        """Writes the file and says what in the rooms is out of reach."""
+        from tdanet_jax.scenes import dataset
+        from tdanet_jax.scenes.offline import importer
+
+        beside = importer.features_path(self.out)
+        if (self.scenes is None) == (self.source is None):
+            fail("import needs a scene file, or --from a folder of FloorPlan*, and not both")
+        if self.features and self.source is None:
+            fail("--features: needs --from")
+        for path in (self.out, beside) if self.features else (self.out,):
+            if path.exists():
+                fail(f"--out {path}: exists")
+        if not self.out.absolute().parent.is_dir():
+            fail(f"--out {self.out}: no such folder")
+        rooms = dataset.Rooms(_rebuilt(self.scenes), None) if self.scenes else self._imported()
+        print_survey(rooms.tables)
+        if self.features and self.source is not None:
+            with reporter("feature maps") as report:
+                importer.write_features(self.source, rooms.tables, beside, report)
+            console.print(f"{beside}")
+        dataset.save(rooms, self.out)
+        console.print(f"{self.out}")
+
+    def _imported(self) -> dataset.Rooms:
+        from tdanet_jax import words
+        from tdanet_jax.scenes.offline import importer
+
+        assert self.source is not None
+        with reporter("import") as report:
+
+            def say(share: float, line: str) -> None:
+                if console.is_terminal:
+                    console.print(line)  # above the bar
+                    line = ""
+                report(share, line)
+
+            rooms = importer.read_folder(self.source, say)
+        if not (rooms.tables.row_box >= 0).any():
+            console.print("No boxes in any room: an agent that sees detections will see nothing.")
+        lacking = words.load_bundled().missing(rooms.tables.classes)
+        if lacking:
+            console.print(f"Needs --word-vectors: no bundled ones for {', '.join(lacking)}")
+        return rooms
+
+
+def _rebuilt(path: Path) -> SceneTables:
+    """The tables of a scene file."""
+    from tdanet_jax.scenes import metadata
+    from tdanet_jax.scenes import tables as scene_tables
+
+    rooms = metadata.read_scenes(path)
+    metadata.check_classes(rooms)
+    with reporter("rooms", every=10) as report:
+        return scene_tables.build(
+            rooms, progress=lambda done, total: report(done / total, "rebuilt")
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Writes rooms as a folder of FloorPlan*, as SAVN, MJOLNIR and SSNet read it."""
+
+    out: Path
+    """Folder to write; must not exist."""
+    scenes: tuple[str, ...] = ()
+    """Rooms to write, say FloorPlan1 FloorPlan2; by default all."""
+    data: str | None = None
+    """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
+    features: bool = False
+    """Also write resnet18_featuremap.hdf5: each view's class raster, one-hot in 512 x 7 x 7."""
+    vectors: bool = False
+    """Also write thor_glove/glove_map<D>d.hdf5, a word vector per class."""
+    word_vectors: str | None = None
+    """With --vectors: file of word vectors in place of the bundled ones."""
+
+    def run(self) -> None:
+        """Writes the folder."""
+        from tdanet_jax import words
+        from tdanet_jax.reward import named_parents
+        from tdanet_jax.scenes import dataset
+        from tdanet_jax.scenes.offline import exporter
 
         if self.out.exists():
             fail(f"--out {self.out}: exists")
-        rooms = metadata.read_scenes(self.scenes)
-        metadata.check_classes(rooms)
-        with reporter("rooms", every=10) as report:
-            tables = scene_tables.build(
-                rooms, progress=lambda done, total: report(done / total, "rebuilt")
-            )
-        print_survey(tables)
-        fresh = self.out.with_name(f".{self.out.name}.{os.getpid()}")
-        try:
-            tables.save(fresh)
-            os.replace(fresh, self.out)
-        finally:
-            fresh.unlink(missing_ok=True)
+        with reporter("rooms", every=30, transient=True) as rebuilt:
+            rooms = dataset.load_rooms(self.data, lambda n, total: rebuilt(n / total, "rebuilt"))
+        tables, extras = rooms.tables, rooms.extras
+        parents = extras.parents if extras and extras.parents else named_parents(tables)
+        if self.scenes:
+            tables = tables.subset(self.scenes)
+        vectors = None
+        if self.vectors:
+            vectors = words.load(self.word_vectors, tables.classes).table(tables.classes, None)
+        with reporter("export", every=30) as report:
+            exporter.write_folder(tables, self.out, report, parents, vectors, self.features)
         console.print(f"{self.out}")
 
 
@@ -265,6 +370,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "verify": Verify,
     "inspect": Inspect,
     "import": Import,
+    "export": Export,
     "collect": Collect,
 }
 

@@ -73,6 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
         else:
             config = command.run
             config.check()
+            config = config.with_absolute_paths()
             folder = command.out or default_folder(config)
             if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
                 fail(f"--out {folder}: exists and is not empty (to go on there: --resume {folder})")
@@ -88,14 +89,13 @@ def default_folder(config: TrainConfig) -> Path:
 
 def train(config: TrainConfig, folder: Path, tensorboard: bool) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
-    from tdanet_jax import episodes, evaluation, figures, policies, report, scenes, words
-    from tdanet_jax.task import make_task, resolve_precision
+    from tdanet_jax import episodes, evaluation, figures, policies, report
+    from tdanet_jax.task import load_task, resolve_precision
     from tdanet_jax.training import Run, read_metrics
 
     with reporter("rooms", every=30, transient=True) as report_rooms:
-        tables = scenes.load_tables(lambda done, total: report_rooms(done / total, "rebuilt"))
-    task = make_task(config, tables, words.load_bundled())
-    lists = episodes.load(tables, task.split)
+        task = load_task(config, lambda done, total: report_rooms(done / total, "rebuilt"))
+    lists = episodes.load(task.tables, task.split, task.extras)
     # What `auto` means here is part of the run: it goes on with the same products elsewhere.
     config = dataclasses.replace(config, network=resolve_precision(config.network))
     folder.mkdir(parents=True, exist_ok=True)
@@ -143,9 +143,10 @@ def train(config: TrainConfig, folder: Path, tensorboard: bool) -> None:
         episodes_trained=int(run.state.episodes),
         seed=config.seed,
         steps=run.steps,
-        data_version=tables.data_version,
+        data_version=task.tables.data_version,
+        data=config.data,
     )
-    print_summary(report.write(folder, provenance, tables, played))
+    print_summary(report.write(folder, provenance, task.tables, played))
     console.print(f"wrote {folder / 'results.md'}")
 
 

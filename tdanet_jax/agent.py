@@ -19,6 +19,7 @@ import numpy as np
 from tdanet_jax import classes as vocabularies
 from tdanet_jax import config as configs
 from tdanet_jax import history
+from tdanet_jax import words as word_vectors
 from tdanet_jax.checkpoint import FOLDER, Checkpoints
 from tdanet_jax.classes import Classes
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
@@ -28,7 +29,7 @@ from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.layers import Carry
 from tdanet_jax.task import make_model
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action, class_words
-from tdanet_jax.words import WordVectors, load_bundled
+from tdanet_jax.words import WordVectors
 
 #: Rows and labels are padded to multiples of these, so that few shapes are ever compiled.
 ROW_BLOCK, LABEL_BLOCK = 16, 64
@@ -205,4 +206,6 @@ def load(run: Path | str) -> Agent:
     if not point and not (folder / FOLDER).is_dir():
         raise ValueError(f"{folder / FOLDER}: no checkpoint")
     weights = history.read(path).weights if point else Checkpoints(folder).weights()
-    return Agent(config, weights, load_bundled(), vocabularies.load(folder))
+    classes = vocabularies.load(folder)
+    vectors = word_vectors.load(config.word_vectors, classes.names)
+    return Agent(config, weights, vectors, classes)

@@ -95,6 +95,11 @@ class TrainConfig:
     """Stop after this much training time, tables, compilation and evaluation not counted."""
     seed: int = 0
     """Seed of parameters, episodes, actions and dropout."""
+    data: str | None = None
+    """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
+    word_vectors: str | None = None
+    """File of word vectors in place of the bundled GloVe 6B 50d: glove.6B.*.txt, the thor_glove
+    hdf5, or an npz with `words` and `vectors`; its width is the network's."""
     validation: bool = False
     """Train on 16 of the 20 training rooms of a type, hold one more class out, and evaluate on the
     other four rooms: for every choice that is not the final number."""
@@ -147,6 +152,16 @@ class TrainConfig:
         for flag, value in shares.items():
             if not 0 <= value <= 1 or (flag == "--dropout" and value == 1):
                 raise ValueError(f"{flag} {value}: must be a share between 0 and 1")
+
+    def with_absolute_paths(self) -> TrainConfig:
+        """The same run, its files named so that they are found from any folder."""
+
+        def absolute(path: str | None) -> str | None:
+            return None if path is None else str(Path(path).absolute())
+
+        return dataclasses.replace(
+            self, data=absolute(self.data), word_vectors=absolute(self.word_vectors)
+        )
 
     @property
     def steps_per_update(self) -> int:

@@ -134,11 +134,13 @@ def _detections(tables: SceneTables, merge: bool) -> tuple[np.ndarray, np.ndarra
     Merged, a class's instances are one row: the centre is the mean of their boxes' corners, S the
     extent over all of them, as in the code of MJOLNIR and SSNet.
     """
-    corners = tables.row_box.astype(np.float64) / (tables.image * tables.subpixel)
+    boxed = tables.row_box[:, 0] >= 0  # what is visible without a known box is no detection
+    corners = tables.row_box[boxed].astype(np.float64) / (tables.image * tables.subpixel)
     centre = (corners[:, :2] + corners[:, 2:]) / 2
-    start, classes = tables.row_start, tables.row_class
+    start = np.concatenate([[0], np.cumsum(boxed)])[tables.row_start]
+    classes = tables.row_class[boxed]
     if merge:
-        key = tables.row_state.astype(np.int64) * len(tables.classes) + tables.row_class
+        key = tables.row_state[boxed].astype(np.int64) * len(tables.classes) + classes
         first = np.flatnonzero(np.diff(key, prepend=-1))
         if first.size:
             members = np.diff(first, append=len(key))[:, None]
@@ -146,7 +148,7 @@ def _detections(tables: SceneTables, merge: bool) -> tuple[np.ndarray, np.ndarra
             least = np.minimum.reduceat(corners[:, :2], first)
             corners = np.hstack([least, np.maximum.reduceat(corners[:, 2:], first)])
         classes = classes[first]
-        start = np.searchsorted(first, tables.row_start)
+        start = np.searchsorted(first, start)
     area = (corners[:, 2] - corners[:, 0]) * (corners[:, 3] - corners[:, 1])
     return start, classes, np.column_stack([centre, area]).astype(np.float32)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from tdanet_jax import assets
 from tdanet_jax.env import POSES_PER_POSITION, ROTATIONS
+from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ROOM_TYPES, UNSEEN, Split, make_split
 
@@ -95,12 +96,56 @@ def build_asset(tables: SceneTables, out_dir: Path) -> Path:
     return out_dir / ASSET
 
 
-def load(tables: SceneTables, split: Split) -> dict[str, Episodes]:
-    """The committed lists of a split: group -> episodes.
+def load(tables: SceneTables, split: Split, extras: Extras | None = None) -> dict[str, Episodes]:
+    """The lists of a split: group -> episodes.
+
+    Those of the bundled rooms are committed. Imported rooms have the published ones that came with
+    them; a group of which none can be solved, and all of rooms without any, are drawn, which gives
+    the same lists every time.
+
+    Args:
+      extras: what came with imported rooms; None with the bundled ones.
 
     Raises:
-      ValueError: the lists belong to other tables.
+      ValueError: the committed lists belong to other tables, or nothing can be evaluated.
     """
+    if extras is None:
+        return _committed(tables, split)
+    lists = draw_split(tables, split) | published(tables, split, extras.episodes)
+    lists = {group: episodes for group, episodes in lists.items() if len(episodes)}
+    if "seen" not in lists:
+        raise ValueError(f"no seen target of split {split.name} can be reached in its test rooms")
+    return lists
+
+
+def published(
+    tables: SceneTables, split: Split, listed: Sequence[PublishedEpisode]
+) -> dict[str, Episodes]:
+    """The published test episodes of a split's evaluation rooms, by group; none for a group
+    without any. Episodes whose target the start cannot reach are left out."""
+    scenes = {name: i for i, name in enumerate(tables.scenes) if name in split.eval_scenes}
+    lists: dict[str, Episodes] = {}
+    for group, targets in zip(GROUPS, (split.seen, split.unseen), strict=True):
+        poses, goals = [], []
+        for episode in listed:
+            scene = scenes.get(episode.scene)
+            if scene is None or episode.part != "test":
+                continue
+            if episode.target not in targets.get(ROOM_TYPES[tables.room_type[scene]], ()):
+                continue
+            here = np.flatnonzero(tables.position_scene == scene)
+            gaps = np.abs(tables.position[here][:, [0, 2]] - (episode.x, episode.z)).max(axis=1)
+            pose = (here[gaps.argmin()] * ROTATIONS + episode.rotation // 45) * 2
+            pose, goal = pose + episode.horizon // 30, tables.targets.index(episode.target)
+            if tables.distance[pose, goal] >= 0:
+                poses.append(pose)
+                goals.append(goal)
+        if poses:
+            lists[group] = Episodes(np.array(poses, np.int32), np.array(goals, np.int32))
+    return lists
+
+
+def _committed(tables: SceneTables, split: Split) -> dict[str, Episodes]:
     with np.load(assets.path(ASSET), allow_pickle=False) as data:
         version = bytes(data["data_version"]).decode()
         if version != tables.data_version:

@@ -48,6 +48,7 @@ class Provenance:
     seed: int
     steps: int
     data_version: str
+    data: str | None = None
 
 
 def columns(tables: SceneTables, episodes: Episodes, records: Records) -> dict[str, np.ndarray]:
@@ -144,7 +145,7 @@ def write(
     groups = {name: columns(tables, *pair) for name, pair in played.items()}
     out = results(provenance, groups)
     (folder / "results.json").write_text(json.dumps(out, indent=2) + "\n")
-    (folder / "results.md").write_text(markdown(out, groups))
+    (folder / "results.md").write_text(markdown(out, groups, provenance.data))
     with (folder / "episodes.jsonl").open("w") as file:
         for name, (_, records) in played.items():
             for row in episode_rows(name, groups[name], records):
@@ -152,8 +153,16 @@ def write(
     return out
 
 
-def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarray]]) -> str:
-    """`results.md`: the tables of the paper's form, with the paper's rows beside ours."""
+def markdown(
+    out: Mapping[str, Any],
+    groups: Mapping[str, Mapping[str, np.ndarray]],
+    data: str | None = None,
+) -> str:
+    """`results.md`: the tables of the paper's form, with the paper's rows beside ours.
+
+    Args:
+      data: file of the rooms, where they are not the bundled ones.
+    """
     lines = [
         f"# {out['model']}, split {out['split']}, seed {out['seed']}",
         "",
@@ -171,7 +180,7 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarra
         for agent, (sr, rate) in PAPER_ROWS.get((out["split"], group), {}).items():
             lines.append(f"| {group} | {agent} (paper) | {sr} | {rate} | | | | |")
     if any(key[0] == out["split"] for key in PAPER_ROWS):
-        lines += ["", WORLDS_DIFFER]
+        lines += ["", WORLDS_DIFFER if data is None else f"These rooms are those of {data}."]
     if "unseen" in groups and (apart := _near_synonyms(groups["unseen"])):
         known = "; ".join(f"{name}: {', '.join(like)}" for name, like in NEAR_SYNONYMS.items())
         lines += ["", f"Unseen classes with a near-synonym known in training ({known}) apart:"]

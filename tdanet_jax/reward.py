@@ -8,12 +8,12 @@ instances are within 1.5 m of each other.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.vocabulary import ROOM_TYPES
+from tdanet_jax.vocabulary import ROOM_TYPES, make_split
 
 #: Reward of any step that earns nothing else, a failed Done included.
 STEP_REWARD = -0.01
@@ -64,6 +64,62 @@ def find_parents(tables: SceneTables, targets: Mapping[str, Sequence[str]]) -> P
             for slot, (share, name) in enumerate(_nearest_classes(tables, target, scenes)):
                 classes[goal, slot] = tables.classes.index(name)
                 reward[goal, slot] = DONE_REWARD * share * PARENT_SHARE
+    return Parents(classes, reward)
+
+
+def named_parents(tables: SceneTables) -> dict[str, dict[str, dict[str, float]]]:
+    """The parents of all 22 targets in the training rooms: room type -> target -> parent -> R_p."""
+    split = make_split("22/0")
+    scenes = [name for name in split.train_scenes if name in tables.scenes]
+    targets = {
+        room: tuple(name for name in names if name in tables.targets)
+        for room, names in split.seen.items()
+    }
+    found = find_parents(tables.subset(scenes), targets)
+    return {
+        room: {
+            target: {
+                tables.classes[c]: float(reward)
+                for c, reward in zip(
+                    found.classes[tables.targets.index(target)],
+                    found.reward[tables.targets.index(target)],
+                    strict=True,
+                )
+                if c >= 0
+            }
+            for target in names
+        }
+        for room, names in targets.items()
+    }
+
+
+def published_parents(
+    tables: SceneTables,
+    targets: Mapping[str, Sequence[str]],
+    published: Mapping[str, Mapping[str, Mapping[str, float]]],
+    hidden: Collection[str],
+) -> Parents:
+    """The parents that came with imported data: R_p itself, so nothing is rescaled.
+
+    Args:
+      tables: their classes are the vocabulary; parents of other names are left out.
+      targets: room type -> target classes; a target without a room type gets no parents.
+      published: room type -> target -> parent -> R_p; the three largest stay.
+      hidden: classes that training must not know, as parents neither.
+    """
+    classes = np.full((len(tables.targets), PARENTS_PER_TARGET), -1, np.int32)
+    reward = np.zeros((len(tables.targets), PARENTS_PER_TARGET), np.float32)
+    for room, names in targets.items():
+        for target in names:
+            known = {
+                name: share
+                for name, share in published.get(room, {}).get(target, {}).items()
+                if name in tables.classes and name not in hidden
+            }
+            best = sorted(known.items(), key=lambda item: (-item[1], item[0]))
+            for slot, (name, share) in enumerate(best[:PARENTS_PER_TARGET]):
+                classes[tables.targets.index(target), slot] = tables.classes.index(name)
+                reward[tables.targets.index(target), slot] = share
     return Parents(classes, reward)
 
 

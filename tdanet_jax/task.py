@@ -8,15 +8,16 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from tdanet_jax import env, graph, zero_shot
+from tdanet_jax import words as word_vectors
 from tdanet_jax.classes import Classes, make_classes
 from tdanet_jax.config import MODELS, NetworkConfig, TrainConfig
 from tdanet_jax.env import TEST_STEP_LIMITS, EnvParams
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.reward import find_parents
-from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.reward import Parents, find_parents, published_parents
+from tdanet_jax.scenes.dataset import Extras, load_rooms
+from tdanet_jax.scenes.tables import Progress, SceneTables
 from tdanet_jax.vocabulary import ROOM_TYPES, Split, make_split
 from tdanet_jax.words import WordVectors
 
@@ -34,6 +35,7 @@ class Task:
       eval_params: all rooms and classes, with the test step limits.
       train_words: [C, D], zero for hidden classes.
       words: [C, D], vectors of all classes.
+      extras: what came with imported rooms; None with the bundled ones.
     """
 
     tables: SceneTables
@@ -44,31 +46,52 @@ class Task:
     eval_params: EnvParams
     train_words: jax.Array
     words: jax.Array
+    extras: Extras | None = None
+
+
+def load_task(config: TrainConfig, progress: Progress | None = None) -> Task:
+    """The task of a configuration on the rooms and with the word vectors that it names.
+
+    Args:
+      progress: called with (rooms done, rooms in all) while bundled rooms are rebuilt.
+
+    Raises:
+      ValueError: a file is broken, or does not hold what the split needs; names the file.
+    """
+    rooms = load_rooms(config.data, progress)
+    vectors = word_vectors.load(config.word_vectors, rooms.tables.classes)
+    try:
+        return make_task(config, rooms.tables, vectors, rooms.extras)
+    except ValueError as error:
+        if config.data is None:
+            raise
+        raise ValueError(f"{config.data}: {error}") from None
 
 
 def make_task(
-    config: TrainConfig,
-    tables: SceneTables,
-    vectors: WordVectors,
-    adjacency: np.ndarray | None = None,
+    config: TrainConfig, tables: SceneTables, vectors: WordVectors, extras: Extras | None = None
 ) -> Task:
-    """The task of a configuration on the given rooms.
+    """The task of a configuration on the given rooms; the split is what they hold of it.
 
     Args:
       config: the run's configuration.
       tables: all rooms.
       vectors: the word vectors.
-      adjacency: [C, C], the class graph of an imported data set; None builds it from the training
-        rooms. Hidden classes are no nodes of either.
+      extras: what came with imported rooms. Their parents and class graph, where there are any,
+        replace those found in the training rooms. Hidden classes are in neither.
+
+    Raises:
+      ValueError: the rooms hold none to train or to evaluate in, or a class has no word vector.
     """
-    split = make_split(config.split, config.validation)
+    split = make_split(config.split, config.validation).within(tables.scenes, tables.classes)
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
+    adjacency = None if extras is None else extras.class_graph(tables.classes)
     if adjacency is None:
         adjacency = graph.co_occurrence(seen_rooms)
     classes = make_classes(tables.classes, split.hidden, adjacency)
     model = make_model(config, classes)
     shown = (model.encoder.ROWS or config.network.rows) == "class", model.encoder.IMAGE
-    parents = find_parents(seen_rooms, split.seen)
+    parents = _parents(seen_rooms, split, extras)
     limits = [config.learner.step_limit] * len(ROOM_TYPES)
     words = vectors.table(tables.classes, config.network.word_norm)
     targets = {room: split.seen[room] + split.unseen[room] for room in ROOM_TYPES}
@@ -81,7 +104,15 @@ def make_task(
         eval_params=env.make_params(tables, targets, parents, TEST_STEP_LIMITS, *shown),
         train_words=jnp.asarray(zero_shot.hide_words(words, tables.classes, split.hidden)),
         words=jnp.asarray(words),
+        extras=extras,
     )
+
+
+def _parents(seen_rooms: SceneTables, split: Split, extras: Extras | None) -> Parents:
+    """Those that came with the rooms, else those found in the training rooms."""
+    if extras is not None and extras.parents:
+        return published_parents(seen_rooms, split.seen, extras.parents, split.hidden)
+    return find_parents(seen_rooms, split.seen)
 
 
 def resolve_precision(config: NetworkConfig) -> NetworkConfig:

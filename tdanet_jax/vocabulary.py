@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Collection
 from enum import IntEnum
 
 
@@ -90,6 +91,38 @@ class Split:
     hidden: frozenset[str]
     seen: dict[str, tuple[str, ...]]
     unseen: dict[str, tuple[str, ...]]
+
+    def within(self, scenes: Collection[str], classes: Collection[str]) -> Split:
+        """What is left of the split in a world of these scenes and classes.
+
+        Raises:
+          ValueError: no room to train or to evaluate in is left.
+        """
+        train = tuple(name for name in self.train_scenes if name in scenes)
+        evaluated = tuple(name for name in self.eval_scenes if name in scenes)
+        for title, wanted, left in (
+            ("training", self.train_scenes, train),
+            ("evaluation", self.eval_scenes, evaluated),
+        ):
+            if not left:
+                raise ValueError(
+                    f"none of the {title} rooms of split {self.name}, "
+                    f"{wanted[0]} to {wanted[-1]}, is among the {len(scenes)} rooms"
+                )
+
+        def present(targets: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+            return {
+                room: tuple(c for c in names if c in classes) for room, names in targets.items()
+            }
+
+        return dataclasses.replace(
+            self,
+            train_scenes=train,
+            eval_scenes=evaluated,
+            hidden=frozenset(self.hidden & set(classes)),
+            seen=present(self.seen),
+            unseen=present(self.unseen),
+        )
 
 
 def scene_name(number: int) -> str:

@@ -38,11 +38,11 @@ class WordVectors:
     index: dict[str, int]
     vectors: np.ndarray
 
-    def embed(self, name: str, norm: float = DEFAULT_NORM) -> np.ndarray:
-        """The vector of a class name or label, scaled to `norm`: its own, else its words' mean.
+    def embed(self, name: str, norm: float | None = DEFAULT_NORM) -> np.ndarray:
+        """The vector of a class name or label: its own, else its words' mean.
 
         Returns:
-          [D] float32 of length `norm`.
+          [D] float32 of length `norm`, or as it is without one.
 
         Raises:
           KeyError: a word of the name has no vector; the message names it.
@@ -54,10 +54,11 @@ class WordVectors:
         if missing or not words:
             raise KeyError(f"no word vector for {missing or name!r} in the label {name!r}")
         mean = self.vectors[[self.index[word] for word in words]].mean(axis=0, dtype=np.float64)
-        return (norm * mean / max(np.linalg.norm(mean), 1e-12)).astype(np.float32)
+        scale = 1.0 if norm is None else norm / max(float(np.linalg.norm(mean)), 1e-12)
+        return (scale * mean).astype(np.float32)
 
-    def table(self, names: Sequence[str], norm: float = DEFAULT_NORM) -> np.ndarray:
-        """One row per name: [len(names), D] float32, each of length `norm`.
+    def table(self, names: Sequence[str], norm: float | None = DEFAULT_NORM) -> np.ndarray:
+        """One row per name: [len(names), D] float32, as `embed` gives it.
 
         Raises:
           ValueError: words have no vector; the message lists them all.

@@ -9,6 +9,7 @@ from tdanet_jax import graph
 from tdanet_jax.classes import Classes
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.scenes import SceneTables
+from tdanet_jax.scenes.dataset import Extras
 from tdanet_jax.task import make_task
 from tdanet_jax.words import WordVectors
 from tests.handmade import Room, corridor, tables_of
@@ -88,7 +89,9 @@ def test_a_graph_from_elsewhere_takes_the_place_of_the_rooms_own(
     mug, sink, toaster = (names.index(name) for name in ("Mug", "Sink", "Toaster"))
     adjacency = np.zeros((len(names), len(names)), np.float32)
     adjacency[mug, sink] = adjacency[mug, toaster] = 1.0
-    task = make_task(TrainConfig(split="18/4"), ithor, glove, adjacency)
+    task = make_task(
+        TrainConfig(split="18/4"), ithor, glove, Extras(graph_classes=names, adjacency=adjacency)
+    )
     assert task.classes.edges == ((mug, sink, 1.0),)  # Toaster is unseen
     own = make_task(TrainConfig(split="18/4"), ithor, glove).classes
     assert 400 < len(own.edges) < 900

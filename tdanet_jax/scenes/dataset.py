@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax.scenes import archive
-from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.scenes import archive, cache
+from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.scenes.tables import Progress, SceneTables
 from tdanet_jax.untrusted import FileError, npz
 from tdanet_jax.vocabulary import ROOM_TYPES
 
@@ -65,15 +66,26 @@ class Extras:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rooms:
-    """Tables and what came beside them."""
+    """Tables and what came beside them; nothing does beside the bundled ones."""
 
     tables: SceneTables
-    extras: Extras
+    extras: Extras | None
+
+
+def load_rooms(path: str | Path | None, progress: Progress | None = None) -> Rooms:
+    """The rooms of a file, or the bundled ones.
+
+    Raises:
+      FileError: it is no file of rooms.
+    """
+    if path is None:
+        return Rooms(cache.load_tables(progress), None)
+    return load(Path(path))
 
 
 def save(rooms: Rooms, path: Path) -> None:
     """Writes a file of rooms; it appears whole or not at all."""
-    extras = rooms.extras
+    extras = rooms.extras or Extras()
     notes = {
         "parents": extras.parents,
         "episodes": [dataclasses.astuple(episode) for episode in extras.episodes],
@@ -128,6 +140,15 @@ def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
         graph_classes=names,
         adjacency=adjacency,
     )
+
+
+def as_scene(tables: SceneTables) -> Scene:
+    """The one room of some tables: its points, and its objects with their boxes in metres."""
+    objects = tuple(
+        SceneObject(name, tables.classes[tables.object_class[i]], box.reshape(2, 3))
+        for i, (name, box) in enumerate(zip(tables.object_id, tables.object_box, strict=True))
+    )
+    return Scene(tables.scenes[0], int(tables.room_type[0]), tables.position, objects)
 
 
 def find_problem(tables: SceneTables) -> str | None:

@@ -118,6 +118,7 @@ def _draw_view(axes: Axes, tables: SceneTables, state: int) -> None:
     axes.set_aspect("equal")
     axes.set_facecolor("#fbfbf8")
     rows = np.arange(tables.row_start[state], tables.row_start[state + 1])
+    rows = rows[tables.row_box[rows, 0] >= 0]
     boxes = tables.row_box[rows] / tables.subpixel
     sizes = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     for i in np.argsort(-sizes):

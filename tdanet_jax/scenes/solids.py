@@ -159,9 +159,10 @@ def void_boxes(scene: Scene, rules: Rules) -> list[np.ndarray]:
     successive rows are joined.
     """
     boxes = np.array([item.box for item in scene.objects])[:, :, [0, 2]]
+    boxes = boxes[np.isfinite(boxes).all(axis=(1, 2))]  # imported objects may have no known place
     ground = scene.points[:, [0, 2]]
-    low = np.minimum(boxes[:, 0].min(axis=0), ground.min(axis=0))
-    high = np.maximum(boxes[:, 1].max(axis=0), ground.max(axis=0))
+    low = np.minimum(boxes[:, 0].min(axis=0, initial=np.inf), ground.min(axis=0))
+    high = np.maximum(boxes[:, 1].max(axis=0, initial=-np.inf), ground.max(axis=0))
     counts = np.maximum(np.ceil((high - low) / CELL), 1).astype(int)
     cells = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1)
     center = low + (cells.reshape(-1, 1, 2) + 0.5) * CELL

@@ -100,8 +100,8 @@ def read_graph(names_path: Path, matrix_path: Path) -> tuple[tuple[str, ...], np
     if matrix.shape != (len(names), len(names)):
         raise FileError(matrix_path, f"shape {matrix.shape} is not that of {len(names)} classes")
     plain = matrix.astype(np.float32)
-    if not np.isfinite(plain).all():
-        raise FileError(matrix_path, "holds NaN or infinity")
+    if not (np.isfinite(plain) & (plain >= 0)).all():
+        raise FileError(matrix_path, "holds NaN, infinity or a weight below 0")
     return names, plain
 
 
