@@ -27,12 +27,14 @@ from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 
 if TYPE_CHECKING:
     import jax
+    from jax.sharding import Mesh
 
+    from tdanet_jax.env import EnvParams
     from tdanet_jax.models.actor_critic import ActorCritic
     from tdanet_jax.task import Task
 
 Row = dict[str, Any]
-Part = Literal["tables", "machine", "environment", "update", "evaluation", "decision"]
+Part = Literal["tables", "machine", "environment", "rollout", "update", "evaluation", "decision"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +45,7 @@ class Command:
         "tables",
         "machine",
         "environment",
+        "rollout",
         "update",
         "evaluation",
         "decision",
@@ -51,11 +54,14 @@ class Command:
     environments: tuple[int, ...] = (1024, 4096, 16384)
     """Numbers of environments in the `environment` part."""
     batches: tuple[int, ...] = (256, 512, 1024)
-    """Numbers of environments in the `update` part."""
+    """Numbers of environments in the `rollout` and `update` parts."""
     precisions: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
-    """Operands of the products in the `update` part."""
+    """Operands of the products in the `rollout` and `update` parts."""
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
+    devices: int = 1
+    """Devices that the environments of the `environment` part are split over; a CPU is split into
+    as many."""
     repeats: int = 5
     """Timed repetitions of each figure."""
     out: Path | None = None
@@ -83,8 +89,10 @@ def measure(command: Command) -> Iterator[Row]:
     """All figures that were asked for, one row each."""
     import jax
 
+    from tdanet_jax import devices
     from tdanet_jax.task import load_task
 
+    mesh = devices.connect(command.devices)
     yield {
         "part": "start",
         "device": str(jax.devices()[0]),
@@ -102,10 +110,12 @@ def measure(command: Command) -> Iterator[Row]:
     if "environment" in command.parts:
         for count in command.environments:
             for observed in (False, True):
-                yield environment_row(task, count, observed, command.repeats)
-    if "update" in command.parts:
-        for precision in command.precisions:
-            for count in command.batches:
+                yield environment_row(task, count, observed, command.repeats, mesh)
+    for precision in command.precisions:
+        for count in command.batches:
+            if "rollout" in command.parts:
+                yield rollout_row(task, precision, count, command.repeats)
+            if "update" in command.parts:
                 yield update_row(task, precision, count, peak, command.repeats)
     if "evaluation" in command.parts:
         yield evaluation_row(task, command.repeats)
@@ -189,20 +199,25 @@ def machine_row(repeats: int) -> Row:
     return row
 
 
-def environment_row(task: Task, count: int, observed: bool, repeats: int) -> Row:
+def environment_row(task: Task, count: int, observed: bool, repeats: int, mesh: Mesh) -> Row:
     """Random actions, auto-reset included; with `observed`, every detection is read."""
     import jax
     import jax.numpy as jnp
 
-    from tdanet_jax import env
+    from tdanet_jax import devices, env
     from tdanet_jax.vocabulary import NUM_ACTIONS
 
     steps = 64
+    params = jax.device_put(task.train_params, devices.everywhere(mesh))
+
+    def split(tree: Any) -> Any:
+        return jax.lax.with_sharding_constraint(tree, devices.split(mesh))
 
     @jax.jit
     def play(key: jax.Array, params: env.EnvParams) -> tuple[jax.Array, env.Observation]:
         reset_key, key = jax.random.split(key)
-        state = jax.vmap(env.reset_state, (0, None))(jax.random.split(reset_key, count), params)
+        keys = jax.random.split(reset_key, count)
+        state = split(jax.vmap(env.reset_state, (0, None))(keys, params))
 
         def body(carry: tuple, key: jax.Array) -> tuple[tuple, jax.Array]:
             state, obs = carry
@@ -212,18 +227,20 @@ def environment_row(task: Task, count: int, observed: bool, repeats: int) -> Row
             following, state, reward, *_ = jax.vmap(env.step, (0, 0, 0, None))(
                 keys, state, action, params
             )
+            state, following = split((state, following))
             return (state, following if observed else obs), reward.sum()
 
         # What is carried is written in every step, and returned, so that it cannot be left out.
-        obs = jax.vmap(env.observe, (0, None))(state, params)
+        obs = split(jax.vmap(env.observe, (0, None))(state, params))
         (_, obs), rewards = jax.lax.scan(body, (state, obs), jax.random.split(key, steps))
         return rewards.sum(), obs
 
-    first, seconds = timed(lambda: play(jax.random.key(0), task.train_params), repeats)
+    first, seconds = timed(lambda: play(jax.random.key(0), params), repeats)
     return {
         "part": "environment",
         "environments": count,
         "observations": observed,
+        "devices": mesh.size,
         "compile_seconds": round(first - seconds, 2),
         "steps_per_second": round(count * steps / seconds),
     }
@@ -243,25 +260,79 @@ def forward_macs(model: ActorCritic, words_width: int) -> int:
     return encoder + action + lstm + hidden * (NUM_ACTIONS + 1)
 
 
+def rollout_row(task: Task, precision: str, count: int, repeats: int) -> Row:
+    """Acting alone: environment, network and what the gradient needs later."""
+    import jax
+
+    from tdanet_jax import learner
+
+    model, config = with_precision(task, precision), LearnerConfig(num_envs=count)
+    state = learner.init(jax.random.key(0), config, model, task.train_words, task.train_params)
+
+    @jax.jit
+    def act(state: Any, words: jax.Array, params: Any) -> Any:
+        return learner.rollout(state, jax.random.key(1), config, model, words, params)
+
+    def call() -> Any:
+        return act(state, task.train_words, task.train_params)
+
+    first, seconds = timed(call, repeats, inner=5)
+    return {
+        "part": "rollout",
+        "precision": precision,
+        "environments": count,
+        "compile_seconds": round(first - seconds, 2),
+        "steps_per_second": round(count * config.rollout_steps / seconds),
+    }
+
+
+def with_precision(task: Task, precision: str) -> ActorCritic:
+    """TDANet with the given operands of the products."""
+    from tdanet_jax.task import make_model
+
+    network = NetworkConfig(precision=precision)  # type: ignore[arg-type]
+    return make_model(TrainConfig(network=network), task.classes)
+
+
 def update_row(task: Task, precision: str, count: int, peak: float | None, repeats: int) -> Row:
     """Rollout, gradient and optimiser step, as the training command runs them."""
+    model = with_precision(task, precision)
+    row = update_cost(model, task.train_words, task.train_params, count, repeats)
+    by_hand = 6 * forward_macs(model, task.train_words.shape[1])
+    gflops = by_hand * row["steps_per_second"] / 1e9
+    return {
+        "part": "update",
+        "precision": precision,
+        **row,
+        "megaflop_per_step_by_hand": round(by_hand / 1e6, 2),
+        "gflops": round(gflops, 1),
+        "share_of_float32_peak": round(gflops / peak, 3) if peak else None,
+    }
+
+
+def update_cost(
+    model: ActorCritic, words: jax.Array, params: EnvParams, count: int, repeats: int
+) -> Row:
+    """Time and memory of an update of `count` environments, and XLA's count of its operations.
+
+    XLA counts the body of a loop once. The work of an update is in loops over the T steps, so its
+    count over the number of environments is that of one environment step, and what is done once
+    per update comes on top.
+    """
     import jax
     import jax.numpy as jnp
 
     from tdanet_jax import learner
-    from tdanet_jax.task import make_model
 
-    network = NetworkConfig(precision=precision)  # type: ignore[arg-type]
-    config = LearnerConfig(num_envs=count)
-    model = make_model(TrainConfig(network=network), task.classes)
-    words, params = task.train_words, task.train_params
-    updates = 5
+    config, updates = LearnerConfig(num_envs=count), 5
     chunk = learner.make_train(config, model, updates)
     state = learner.init(jax.random.key(0), config, model, words, params)
     share = jnp.zeros(2)
     began = time.perf_counter()
     compiled = chunk.lower(state, share, words, params).compile()
     compile_seconds = time.perf_counter() - began
+    memory: Any = compiled.memory_analysis()
+    cost: Any = compiled.cost_analysis()
 
     def call() -> Any:
         nonlocal state
@@ -269,16 +340,14 @@ def update_row(task: Task, precision: str, count: int, peak: float | None, repea
         return metrics
 
     _, seconds = timed(call, repeats)
-    steps = count * config.rollout_steps * updates
-    gflops = 6 * forward_macs(model, words.shape[1]) * steps / seconds / 1e9
     return {
-        "part": "update",
-        "precision": precision,
         "environments": count,
         "compile_seconds": round(compile_seconds, 2),
-        "steps_per_second": round(steps / seconds),
-        "gflops": round(gflops, 1),
-        "share_of_float32_peak": round(gflops / peak, 3) if peak else None,
+        "steps_per_second": round(count * config.rollout_steps * updates / seconds),
+        "megaflop_per_step_compiled": round(cost["flops"] / count / 1e6, 2),
+        "kilobytes_per_step_compiled": round(cost["bytes accessed"] / count / 1e3, 1),
+        "arguments_mb": round(memory.argument_size_in_bytes / 1e6, 1),
+        "temporary_mb": round(memory.temp_size_in_bytes / 1e6, 1),
     }
 
 
@@ -348,7 +417,7 @@ def processor() -> str:
 def as_table(rows: list[Row]) -> Table:
     """All rows as one table: the part, its setting, and its figures."""
     table = Table("part", "setting", "figures")
-    settings = ("environments", "observations", "precision", "batch", "episodes")
+    settings = ("environments", "devices", "observations", "precision", "batch", "episodes")
     for row in rows:
         setting = ", ".join(f"{k} {row[k]}" for k in settings if k in row)
         figures = ", ".join(f"{k} {v}" for k, v in row.items() if k not in (*settings, "part"))

@@ -9,7 +9,7 @@ Axis letters: T steps of a rollout, B environments, H units, K detections, C cla
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,9 @@ from tdanet_jax.vocabulary import NUM_ACTIONS
 
 class TrainState(struct.PyTreeNode):
     """All that a run needs to go on exactly where it was."""
+
+    #: Fields whose arrays have a row per environment.
+    PER_ENVIRONMENT: ClassVar = ("env_state", "held", "carry", "previous", "fresh")
 
     params: Any
     opt_state: optax.OptState
@@ -273,11 +276,14 @@ def _episode_sums(steps: Rollout) -> dict[str, jax.Array]:
     }
 
 
-def make_train(config: LearnerConfig, model: ActorCritic, updates: int) -> jax.stages.Wrapped:
+def make_train(
+    config: LearnerConfig, model: ActorCritic, updates: int, shardings: Any = None
+) -> jax.stages.Wrapped:
     """Compiles `updates` updates into one call: `chunk(state, progress, words, params)`.
 
     `progress` is a pair, the share of the budget spent before and after the chunk. The call
     returns the state and the metrics, stacked over the updates. The state's buffers are donated.
+    `shardings` says where the state and the metrics lie, on several devices.
     """
 
     def chunk(
@@ -289,4 +295,4 @@ def make_train(config: LearnerConfig, model: ActorCritic, updates: int) -> jax.s
 
         return jax.lax.scan(body, state, jnp.arange(updates))
 
-    return jax.jit(chunk, donate_argnums=0)
+    return jax.jit(chunk, donate_argnums=0, out_shardings=shardings)

@@ -1,0 +1,180 @@
+"""Measures how the cost of training grows with environments, rooms, classes and detections.
+
+    python -m experiments.scaling --out scaling
+
+One size is changed at a time, the others stay as they are by default. More rooms are the 120 rooms
+repeated, more classes and detections are rows that never occur: what is measured is their size.
+Writes scaling.jsonl and scaling.png into --out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from experiments.benchmark import Row, update_cost
+from experiments.console import console, fail, one_line_errors, parse, reporter
+from tdanet_jax.config import TrainConfig
+
+if TYPE_CHECKING:
+    import jax
+    import numpy as np
+
+    from tdanet_jax.env import EnvParams
+    from tdanet_jax.scenes import SceneTables
+    from tdanet_jax.task import Task
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Measures how the cost of training grows with environments, rooms, classes and detections."""
+
+    environments: tuple[int, ...] = (32, 64, 128, 256, 512, 1024, 2048)
+    """Numbers of environments."""
+    rooms: tuple[int, ...] = (10, 30, 80, 250, 1000)
+    """Numbers of training rooms; 80 are there."""
+    classes: tuple[int, ...] = (118, 250, 500, 1000, 2000)
+    """Sizes of the vocabulary; at least 118."""
+    detections: tuple[int, ...] = (74, 128, 256, 512)
+    """Rows of an observation; at least as many as a frame can hold."""
+    repeats: int = 3
+    """Timed repetitions of each figure."""
+    out: Path = Path("scaling")
+    """Folder to write; must be new or empty."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command."""
+    command = parse(Command, arguments, prog="scaling")
+    with one_line_errors():
+        if command.out.exists() and (not command.out.is_dir() or any(command.out.iterdir())):
+            fail(f"--out {command.out}: exists and is not empty")
+        for flag in ("environments", "rooms", "classes", "detections", "repeats"):
+            value = getattr(command, flag)
+            if min(value if isinstance(value, tuple) else (value,), default=1) < 1:
+                fail(f"--{flag}: must be positive")
+        scale(command)
+
+
+def scale(command: Command) -> None:
+    """Measures every size and writes the figures and the plot."""
+    from tdanet_jax import figures, scenes, words
+    from tdanet_jax.task import make_task
+
+    task = make_task(TrainConfig(), scenes.load_tables(), words.load_bundled())
+    sizes = ("environments", "rooms", "classes", "detections")
+    total = sum(len(getattr(command, size)) for size in sizes)
+    rows = []
+    with reporter("measuring", transient=True) as show:
+        for row in measure(command, task):
+            rows.append(row)
+            show(len(rows) / total, f"{row['size']} {row['value']}")
+    command.out.mkdir(parents=True, exist_ok=True)
+    path = command.out / "scaling.jsonl"
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    figures.scaling(rows, command.out / "scaling.png")
+    console.print(f"wrote {path} and {command.out / 'scaling.png'}")
+
+
+def measure(command: Command, task: Task) -> Iterator[Row]:
+    """A row for every size and value."""
+    import jax.numpy as jnp
+
+    from tdanet_jax.config import LearnerConfig
+
+    count = LearnerConfig().num_envs
+    model, words, params = task.model, task.train_words, task.train_params
+
+    def row(size: str, value: int, words: jax.Array, params: EnvParams, count: int) -> Row:
+        return {"size": size, "value": value} | update_cost(
+            model, words, params, count, command.repeats
+        )
+
+    for value in command.environments:
+        yield row("environments", value, words, params, value)
+    for value in command.rooms:
+        yield row("rooms", value, words, with_rooms(task, value), count)
+    for value in command.classes:
+        if value < len(words):
+            raise ValueError(f"--classes {value}: the rooms have {len(words)}")
+        padded = jnp.pad(words, ((0, value - len(words)), (0, 0)))
+        yield row("classes", value, padded, params, count)
+    for value in command.detections:
+        yield row("detections", value, words, with_detections(params, value), count)
+
+
+def with_rooms(task: Task, count: int) -> EnvParams:
+    """The environment of `count` training rooms: some of them, or all of them several times."""
+    import numpy as np
+
+    from tdanet_jax import env
+    from tdanet_jax.reward import Parents
+
+    names = task.split.train_scenes
+    per_type = len(names) // 4
+    by_turn = sorted(
+        names, key=lambda name: names.index(name) % per_type
+    )  # all types from the start
+    parts = [task.tables.subset(names)] * (count // len(names))
+    if count % len(names):
+        parts.append(task.tables.subset(by_turn[: count % len(names)]))
+    old = task.train_params
+    parents = Parents(np.asarray(old.parent_class), np.asarray(old.parent_reward))
+    tables = joined(parts)
+    return env.make_params(tables, task.split.seen, parents, old.step_limit.tolist(), merge=False)
+
+
+def joined(parts: list[SceneTables]) -> SceneTables:
+    """The rooms of all parts, which share classes and targets, one after the other."""
+    import numpy as np
+
+    def stacked(name: str, first: Callable[[SceneTables], int] | None = None) -> np.ndarray:
+        """A field of all parts; indices are moved by the sizes of the parts before."""
+        moved, offset = [], 0
+        for part in parts:
+            values = getattr(part, name)
+            moved.append(values if first is None else values + np.asarray(offset, values.dtype))
+            offset += 0 if first is None else first(part)
+        return np.concatenate(moved)
+
+    def count_scenes(part: SceneTables) -> int:
+        return len(part.scenes)
+
+    def count_objects(part: SceneTables) -> int:
+        return len(part.object_class)
+
+    counts = np.concatenate([np.diff(part.row_start) for part in parts])
+    names = ("room_type", "position", "row_box", "row_visible", "object_class", "object_box")
+    plain: dict[str, Any] = {name: stacked(name) for name in (*names, "distance", "raster")}
+    return dataclasses.replace(
+        parts[0],
+        scenes=tuple(f"{name}-{i}" for i, part in enumerate(parts) for name in part.scenes),
+        object_id=tuple(name for part in parts for name in part.object_id),
+        position_scene=stacked("position_scene", count_scenes),
+        object_scene=stacked("object_scene", count_scenes),
+        next_position=stacked("next_position", lambda part: len(part.position)),
+        row_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
+        row_object=stacked("row_object", count_objects),
+        **plain,
+    )
+
+
+def with_detections(params: EnvParams, rows: int) -> EnvParams:
+    """The same environment with more rows in an observation."""
+    import jax.numpy as jnp
+
+    more = rows - params.max_detections
+    if more < 0:
+        raise ValueError(f"--detections {rows}: a frame holds up to {params.max_detections}")
+    return params.replace(
+        max_detections=rows,
+        row_class=jnp.pad(params.row_class, (0, more)),
+        row_box=jnp.pad(params.row_box, ((0, more), (0, 0))),
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""One update on eight devices is the update on one; what cannot be laid out is refused."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import pytest
+
+from tdanet_jax import devices
+
+#: In a process of its own, which alone can split its CPU into eight devices.
+EIGHT = """
+import dataclasses, jax, numpy as np
+from tdanet_jax import devices
+mesh = devices.connect(8)
+from jax.sharding import Mesh
+from tdanet_jax import learner
+from tests.test_learner import CONFIG, MODEL, PARAMS, WORDS
+
+config = dataclasses.replace(CONFIG, num_envs=24)
+ends = []
+for over in (Mesh(np.array(jax.devices()[:1]), (devices.AXIS,)), mesh):
+    state = learner.init(jax.random.key(0), config, MODEL, WORDS, PARAMS)
+    layout = devices.layout(state, over)
+    state = jax.device_put(state, layout)
+    words, params = jax.device_put((WORDS, PARAMS), devices.everywhere(over))
+    chunk = learner.make_train(config, MODEL, 1, (layout, devices.everywhere(over)))
+    after, metrics = chunk(state, jax.numpy.zeros(2), words, params)
+    assert {len(x.sharding.device_set) for x in jax.tree.leaves(after)} == {over.size}
+    assert after.previous.addressable_shards[0].data.shape == (24 // over.size, 6)
+    ends.append(jax.device_get((after.replace(key=0), metrics)))
+(one, one_metrics), (many, many_metrics) = ends
+for name in ("env_state", "held", "fresh", "updates", "episodes"):  # what the actions led to
+    same = jax.tree.map(np.array_equal, getattr(one, name), getattr(many, name))
+    assert all(jax.tree.leaves(same)), name
+close = lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-6)
+jax.tree.map(close, one.params, many.params)
+jax.tree.map(close, one_metrics, many_metrics)
+print("equal")
+"""
+
+
+def test_an_update_on_eight_devices_is_the_update_on_one():
+    environment = os.environ | {"PYTHONPATH": os.getcwd()}
+    done = subprocess.run(
+        [sys.executable, "-c", EIGHT], capture_output=True, text=True, env=environment
+    )
+    assert done.stdout == "equal\n", done.stderr
+
+
+def test_more_devices_than_there_are_is_one_clear_error():
+    present = jax.local_device_count()  # this process uses its CPU already
+    with pytest.raises(ValueError, match=f"--devices {present + 1}: this machine has {present}"):
+        devices.connect(present + 1)
+    with pytest.raises(ValueError, match="--devices 0: must be positive"):
+        devices.connect(0)
+
+
+def test_a_process_that_does_not_know_its_number_is_one_clear_error(monkeypatch):
+    monkeypatch.setenv(devices.ADDRESS, "localhost:1234")
+    with pytest.raises(ValueError, match=f"{devices.PROCESSES} and {devices.PROCESS}"):
+        devices.connect()
+
+
+def test_a_process_on_its_own_agrees_with_itself():
+    assert devices.is_lead()
+    assert devices.from_lead(0.1) == 0.1
+    assert devices.anywhere(True)
+    assert not devices.anywhere(False)
