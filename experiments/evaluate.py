@@ -1,31 +1,41 @@
-"""Evaluates a trained agent, or one that needs no training, on the fixed test episodes.
+"""Evaluates trained agents, or one that needs no training, on the fixed test episodes.
 
     python -m experiments.evaluate --checkpoint runs/... --policy greedy
+    python -m experiments.evaluate --checkpoint runs/... --history
+    python -m experiments.evaluate --checkpoint runs/a --checkpoint runs/b --out compared
     python -m experiments.evaluate --policy random --split 18/4 --out random
 
-Writes results.json, results.md and episodes.jsonl into --out (by default <checkpoint>/<policy>).
+One agent: results.json, results.md and episodes.jsonl. Several checkpoints, or a run's history:
+evaluations.json, evaluations.md, episodes.jsonl and, of a history, learning_curve.png.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from experiments.console import console, fail, one_line_errors, parse, print_summary
-from tdanet_jax import config as configs
-from tdanet_jax.config import CONFIG_FILE, TrainConfig
+import tyro
+
+from experiments.console import console, fail, one_line_errors, parse, print_summary, reporter
+from tdanet_jax.config import TrainConfig
 
 if TYPE_CHECKING:
-    from tdanet_jax.task import Task
+    from tdanet_jax.saved import Saved
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Evaluates a trained agent, or one that needs no training, on the fixed test episodes."""
+    """Evaluates trained agents, or one that needs no training, on the fixed test episodes."""
 
-    checkpoint: Path | None = None
-    """Folder of a run; its newest checkpoint is evaluated."""
+    checkpoint: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    """Folder of a run; its newest checkpoint is evaluated. Give the flag again for more runs: they
+    are played in one compiled call and set beside one another."""
+    history: bool = False
+    """Evaluate the whole history of each run in place of its newest checkpoint, and draw the
+    learning curve."""
     policy: Literal["sample", "greedy", "random", "shortest_path"] = "sample"
     """sample and greedy: how the network's actions are chosen. random and shortest_path need no
     checkpoint; the latter knows the way."""
@@ -37,7 +47,8 @@ class Command:
     seed: int = 0
     """Seed of sampled actions."""
     out: Path | None = None
-    """Folder to write; must be new or empty."""
+    """Folder to write; must be new or empty. By default <checkpoint>/<policy> for one checkpoint,
+    <checkpoint>/history-<policy> for its history, runs/<policy> without one."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -45,68 +56,103 @@ def main(arguments: list[str] | None = None) -> None:
     command = parse(Command, arguments, prog="evaluate")
     with one_line_errors():
         trained = command.policy in ("sample", "greedy")
-        if trained and command.checkpoint is None:
+        if trained and not command.checkpoint:
             fail(f"--policy {command.policy} needs --checkpoint")
-        if not trained and command.checkpoint is not None:
+        if not trained and command.checkpoint:
             fail(f"--policy {command.policy} takes no --checkpoint")
-        if command.checkpoint is None:
-            config = TrainConfig(split=command.split, data=command.data)
-            config.check()
-        else:
-            config = configs.load(command.checkpoint / CONFIG_FILE)
-            if command.data is not None:
-                config = dataclasses.replace(config, data=command.data)
-        folder = command.out or (command.checkpoint or Path("runs")) / command.policy
+        if not trained and command.history:
+            fail(f"--policy {command.policy} has no --history")
+        if len(set(command.checkpoint)) < len(command.checkpoint):
+            fail("--checkpoint: a run is given twice")
+        TrainConfig(split=command.split).check()
+        folder = command.out or default_folder(command)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             fail(f"--out {folder}: exists and is not empty")
-        evaluate(command, config, folder)
+        if not trained:
+            evaluate_untrained(command, folder)
+            return
+        from tdanet_jax import saved
+
+        networks = [
+            n for run in command.checkpoint for n in saved.find(run, command.history, command.data)
+        ]
+        if command.history or len(networks) > 1:
+            evaluate_several(command, networks, folder)
+        else:
+            evaluate_one(command, networks[0], folder)
 
 
-def evaluate(command: Command, config: TrainConfig, folder: Path) -> None:
-    """Plays the episodes and writes the results."""
+def default_folder(command: Command) -> Path:
+    """Where to write if nothing is said."""
+    if len(command.checkpoint) > 1:
+        fail("several checkpoints need --out")
+    kind = f"history-{command.policy}" if command.history else command.policy
+    return (command.checkpoint[0] if command.checkpoint else Path("runs")) / kind
+
+
+def evaluate_untrained(command: Command, folder: Path) -> None:
+    """Random or the shortest path."""
     from tdanet_jax import episodes, evaluation, policies, report
     from tdanet_jax.task import load_task
-    from tdanet_jax.training import Run
 
-    task = load_task(config)
-    tables = task.tables
-    lists = episodes.load(tables, task.split, task.extras)
-    weights, trained, steps = None, 0, 0
-    if command.checkpoint is None:
-        policy = {"random": policies.random, "shortest_path": policies.shortest_path}[
-            command.policy
-        ]()
-    else:
-        check_vocabulary(command.checkpoint, config, task)
-        run = Run(command.checkpoint, config, task, other_rooms=command.data is not None)
-        if run.fresh:
-            fail(f"{command.checkpoint}: no checkpoint")
-        policy = policies.network(run.model, task.words, greedy=command.policy == "greedy")
-        weights, trained, steps = run.state.params, int(run.state.episodes), run.steps
-    played = evaluation.evaluate_lists(policy, weights, task.eval_params, lists, command.seed)
+    task = load_task(TrainConfig(split=command.split, data=command.data))
+    lists = episodes.load(task.tables, task.split, task.extras)
+    make = {"random": policies.random, "shortest_path": policies.shortest_path}[command.policy]
+    played = evaluation.evaluate_lists(make(), None, task.eval_params, lists, command.seed)
     provenance = report.Provenance(
         split=task.split.name,
-        model=command.policy if weights is None else config.model,
+        model=command.policy,
         policy=command.policy,
-        episodes_trained=trained,
-        seed=config.seed if weights is not None else command.seed,
-        steps=steps,
-        data_version=tables.data_version,
-        data=config.data,
+        episodes_trained=0,
+        seed=command.seed,
+        steps=0,
+        data_version=task.tables.data_version,
+        data=command.data,
     )
     folder.mkdir(parents=True, exist_ok=True)
-    print_summary(report.write(folder, provenance, tables, played))
+    print_summary(report.write(folder, provenance, task.tables, played))
     console.print(f"wrote {folder / 'results.md'}")
 
 
-def check_vocabulary(run: Path, config: TrainConfig, task: Task) -> None:
-    """Ends the program if a model that numbers its classes is to see rooms with others."""
-    from tdanet_jax import classes
+def evaluate_one(command: Command, network: Saved, folder: Path) -> None:
+    """The newest checkpoint of one run."""
+    from tdanet_jax import report, saved
 
-    names = classes.load(run).names
-    numbered = task.model.encoder.ROWS == "class" or task.model.encoder.IMAGE
-    if numbered and names and names != task.tables.classes:
-        fail(f"--data {config.data}: {config.model} knows the classes of {run} alone, in number")
+    done = next(saved.evaluate([network], command.policy == "greedy", command.seed))
+    folder.mkdir(parents=True, exist_ok=True)
+    print_summary(report.write(folder, done.provenance, done.task.tables, done.played))
+    console.print(f"wrote {folder / 'results.md'}")
+
+
+def evaluate_several(command: Command, networks: Sequence[Saved], folder: Path) -> None:
+    """Several runs, or the history of one or more."""
+    from tdanet_jax import comparison, figures, report, saved
+
+    results, records = {}, []
+    greedy = command.policy == "greedy"
+    with reporter("evaluating", every=10) as show:
+        for done in saved.evaluate(networks, greedy, command.seed):
+            results[done.saved] = done.results()
+            where = {"run": str(done.saved.run), "updates": done.snapshot.updates}
+            records += [{**where, **row} for row in report.all_rows(done.task.tables, done.played)]
+            show(len(results) / len(networks), f"{done.saved.run.name} {done.snapshot.updates:,}")
+    ordered = [results[network] for network in networks]
+    names = [network.run.name for network in networks]
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "episodes.jsonl").open("w") as file:
+        file.writelines(json.dumps(record) + "\n" for record in records)
+    (folder / "evaluations.json").write_text(json.dumps(ordered, indent=2) + "\n")
+    page = comparison.markdown(f"{len(networks)} checkpoints", ordered, names)
+    (folder / "evaluations.md").write_text(page)
+    if command.history:
+        curves = [
+            comparison.curve(run.name, [[r for n, r in results.items() if n.run == run]])
+            for run in command.checkpoint
+        ]
+        figures.evaluated_curves(
+            curves, "Test rooms, while training", folder / "learning_curve.png"
+        )
+    console.print(f"wrote {folder / 'evaluations.md'}")
 
 
 if __name__ == "__main__":

@@ -6,12 +6,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from tdanet_jax.comparison import GROUPS, MEASURES, Curve
+
 #: Colours (Okabe and Ito) that stay apart for the colour-blind and, with the dashes, in grey.
 BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"
+PALETTE = (BLUE, ORANGE, GREEN, "#CC79A7", "#000000", "#E69F00", "#56B4E9", "#F0E442")
+#: Shapes for many lines in one picture, so that they stay apart without colour.
+MARKERS = "osD^vPX*"
 
 
 def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> None:
@@ -33,10 +40,7 @@ def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> No
     left.legend(**place)
     right.legend(handles=[*right.get_lines(), *entropy.get_lines()], **place)
     for axis in (left, right):
-        axis.set_xlabel("training episodes")
-        axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x / 1000:,.0f}k"))
-        axis.grid(alpha=0.3)
-        axis.spines[["top"]].set_visible(False)
+        _episodes_along(axis)
     figure.suptitle(title)
     figure.savefig(path, dpi=130)
 
@@ -69,3 +73,50 @@ def scaling(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 _MEMORY = {"temporary_mb": "rollout and tape", "arguments_mb": "rooms, parameters, state"}
+
+
+def evaluated_curves(curves: Sequence[Curve], title: str, path: Path) -> None:
+    """SR and SPL in the test rooms against training episodes, from evaluated histories.
+
+    Seen targets are solid lines, unseen ones dashed; a band is one deviation over seeds.
+    """
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 2)
+    for axis, measure in zip(axes, MEASURES, strict=True):
+        for i, curve in enumerate(curves):
+            style = PALETTE[i % len(PALETTE)], MARKERS[i % len(MARKERS)]
+            for group in GROUPS:
+                _draw_curve(axis, curve, group, measure, *style)
+        axis.set(ylabel=f"{measure}, per cent, test rooms", ylim=(0, None), xlim=(0, None))
+        _episodes_along(axis)
+    figure.suptitle(title)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    figure.savefig(path, dpi=130)
+
+
+def _draw_curve(
+    axis: Axes, curve: Curve, group: str, measure: str, colour: str, marker: str
+) -> None:
+    """One line of a learning curve, with its band, if there is anything to draw."""
+    points = zip(curve.episodes, curve.values[group, measure], strict=True)
+    known = [(x, y.mean, y.sd or 0.0) for x, y in points if y is not None]
+    if not known:
+        return
+    x, mean, sd = np.array(known).T
+    seen = group == "seen"
+    axis.plot(
+        x, mean, "-" if seen else "--", color=colour, marker=marker, markersize=4, linewidth=1.5,
+        markerfacecolor=colour if seen else "white", label=f"{curve.label}, {group}",
+    )  # fmt: skip
+    if sd.any():
+        axis.fill_between(x, mean - sd, mean + sd, color=colour, alpha=0.15, linewidth=0)
+
+
+def _episodes_along(axis: Axes) -> None:
+    """Training episodes along the x axis; a light grid and no upper border."""
+    axis.set_xlabel("training episodes")
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x / 1000:,.0f}k"))
+    axis.grid(alpha=0.3)
+    axis.spines[["top"]].set_visible(False)

@@ -6,13 +6,14 @@ import dataclasses
 import importlib.resources
 import json
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import tdanet_jax
+from tdanet_jax import files, paper
 from tdanet_jax.episodes import Episodes
 from tdanet_jax.evaluation import Records
 from tdanet_jax.metrics import BUCKETS, grouped, summarise
@@ -21,15 +22,6 @@ from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS, ROOM_TYPES
 
 RESULTS_VERSION = 1
 
-#: The paper's Table I (Lian and Zhang 2024), SR and SPL in percent for L >= 1, by split and group.
-PAPER_ROWS = {
-    ("18/4", "seen"): {"Random": (11.2, 5.1), "TDANet": (74.7, 29.7)},
-    ("18/4", "unseen"): {"TDANet": (62.5, 25.3)},
-}
-WORLDS_DIFFER = (
-    "The worlds differ: the paper used AI2-THOR 1.0.1 and its own test episodes; these rooms are "
-    "rebuilt from the metadata of a later version and have longer episodes on average."
-)
 #: Unseen classes that have a near-synonym among the classes known in training.
 NEAR_SYNONYMS = {
     "ToiletPaper": ("ToiletPaperHanger", "PaperTowelRoll"),
@@ -144,13 +136,20 @@ def write(
     """Writes `results.json`, `results.md` and `episodes.jsonl`; returns the results."""
     groups = {name: columns(tables, *pair) for name, pair in played.items()}
     out = results(provenance, groups)
-    (folder / "results.json").write_text(json.dumps(out, indent=2) + "\n")
-    (folder / "results.md").write_text(markdown(out, groups, provenance.data))
-    with (folder / "episodes.jsonl").open("w") as file:
-        for name, (_, records) in played.items():
-            for row in episode_rows(name, groups[name], records):
-                file.write(json.dumps(row) + "\n")
+    with files.replacing(folder / "episodes.jsonl") as fresh, fresh.open("w") as file:
+        file.writelines(json.dumps(row) + "\n" for row in all_rows(tables, played))
+    files.write_text(folder / "results.md", markdown(out, groups, provenance.data))
+    # The last file, and whole: where it is, the others are.
+    files.write_text(folder / "results.json", json.dumps(out, indent=2) + "\n")
     return out
+
+
+def all_rows(
+    tables: SceneTables, played: Mapping[str, tuple[Episodes, Records]]
+) -> Iterator[dict[str, Any]]:
+    """The records of every group."""
+    for name, (episodes, records) in played.items():
+        yield from episode_rows(name, columns(tables, episodes, records), records)
 
 
 def markdown(
@@ -177,10 +176,9 @@ def markdown(
         if out[group] is None:
             continue
         lines.append(_row((group, f"**{out['model']} (ours)**"), out[group]))
-        for agent, (sr, rate) in PAPER_ROWS.get((out["split"], group), {}).items():
-            lines.append(f"| {group} | {agent} (paper) | {sr} | {rate} | | | | |")
-    if any(key[0] == out["split"] for key in PAPER_ROWS):
-        lines += ["", WORLDS_DIFFER if data is None else f"These rooms are those of {data}."]
+        lines += [_paper_row(group, *row) for row in paper.rates(out["split"], group)]
+    if any(rate.split == out["split"] for rate in paper.RATES):
+        lines += ["", paper.worlds(data)]
     if "unseen" in groups and (apart := _near_synonyms(groups["unseen"])):
         known = "; ".join(f"{name}: {', '.join(like)}" for name, like in NEAR_SYNONYMS.items())
         lines += ["", f"Unseen classes with a near-synonym known in training ({known}) apart:"]
@@ -218,6 +216,14 @@ def _row(first: tuple[str, ...], buckets: Mapping[str, Mapping[str, Any]]) -> st
     for bucket in BUCKETS:
         part = buckets[bucket]
         cells += [_cell(part, "SR"), _cell(part, "SPL"), str(part["n"])]
+    return f"| {' | '.join(cells)} |"
+
+
+def _paper_row(group: str, agent: str, rates: Mapping[str, paper.Rate]) -> str:
+    cells = [group, f"{agent} (paper)"]
+    for bucket in BUCKETS:
+        rate = rates.get(bucket)
+        cells += ["-", "-", ""] if rate is None else [f"{rate.sr:.1f}", f"{rate.spl:.1f}", ""]
     return f"| {' | '.join(cells)} |"
 
 

@@ -26,14 +26,8 @@ Row = dict[str, Any]
 class Run:
     """A run in its folder. `state` is where it is, `seconds` the training time so far."""
 
-    def __init__(
-        self, folder: Path, config: TrainConfig, task: Task, other_rooms: bool = False
-    ) -> None:
+    def __init__(self, folder: Path, config: TrainConfig, task: Task) -> None:
         """The run in `folder`, new or as its newest checkpoint has it.
-
-        Args:
-          other_rooms: the task's rooms need not be those that the run was trained on; for
-            evaluation alone.
 
         Raises:
           ValueError: the checkpoint does not fit the configuration or the rooms.
@@ -45,7 +39,7 @@ class Run:
         self.seconds = 0.0
         self.checkpoints = Checkpoints(folder)
         self._saved: int | None = None  # updates of the checkpoint that holds the present state
-        self.state: TrainState = self._make_state() if self.fresh else self._restore(other_rooms)
+        self.state: TrainState = self._make_state() if self.fresh else self._restore()
 
     @property
     def fresh(self) -> bool:
@@ -59,9 +53,9 @@ class Run:
             key, self.config.learner, self.model, task.train_words, task.train_params
         )
 
-    def _restore(self, other_rooms: bool) -> TrainState:
+    def _restore(self) -> TrainState:
         state, meta = self.checkpoints.restore(self._make_state)
-        if not other_rooms and meta["data_version"] != self.task.tables.data_version:
+        if meta["data_version"] != self.task.tables.data_version:
             raise ValueError(
                 f"{self.folder}: trained on scene tables {meta['data_version']}, "
                 f"these are {self.task.tables.data_version}"

@@ -235,3 +235,42 @@ def test_sampled_actions_follow_the_probabilities_of_the_network(
     # A share of 4,000 draws has a standard deviation of at most 0.008.
     np.testing.assert_allclose(share, jax.nn.softmax(out.logits)[0], atol=0.04)
     chex.assert_shape(records.actions, (4000, 200))
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_stacked_networks_play_as_each_of_them_alone(
+    rooms: SceneTables, params: EnvParams, batched: bool
+) -> None:
+    weights, words = network_weights(len(rooms.classes))
+    several = [
+        weights,
+        jax.tree.map(lambda x: 0.5 * x, weights),
+        jax.tree.map(jnp.negative, weights),
+    ]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
+    policy = policies.network(MODEL, words)
+    lists = {"seen": drawn(rooms, 5), "unseen": drawn(rooms, 5, seed=1)}
+    together = evaluation.evaluate_stacked(policy, stacked, params, lists, 3, batched)
+    assert len(together) == 3
+    for one, played in zip(several, together, strict=True):
+        alone = evaluation.evaluate_lists(policy, one, params, lists, 3)
+        for group, (chosen, records) in alone.items():
+            assert played[group][0] is chosen
+            for field in ("shortest", "length", "success", "actions"):
+                np.testing.assert_array_equal(
+                    getattr(played[group][1], field), getattr(records, field)
+                )
+    lengths = [played["seen"][1].length.tolist() for played in together]
+    assert lengths[0] != lengths[1] != lengths[2]
+
+
+def test_a_history_of_any_length_is_traced_once_a_list(
+    rooms: SceneTables, params: EnvParams
+) -> None:
+    weights, words = network_weights(len(rooms.classes))
+    stacked = jax.tree.map(lambda x: jnp.stack([x] * 20), weights)
+    policy = policies.network(MODEL, words)
+    traced = chex.assert_max_traces(policy.act, n=1)
+    counted = Policy(policy.start, traced)
+    lists = {"seen": drawn(rooms, 1), "unseen": drawn(rooms, 1)}  # of one shape: one compilation
+    assert len(evaluation.evaluate_stacked(counted, stacked, params, lists, 0)) == 20

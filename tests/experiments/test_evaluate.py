@@ -1,11 +1,22 @@
 """The evaluation command, as a user types it."""
 
+import dataclasses
 import json
 import os
+import shutil
 import subprocess
 import sys
 
+import jax
 import pytest
+
+from experiments import evaluate
+from tdanet_jax import config as configs
+from tdanet_jax import history
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.history import Snapshot
+from tdanet_jax.task import make_task
+from tests.test_agent import OLD_RUN
 
 COMMAND = [sys.executable, "-m", "experiments.evaluate"]
 
@@ -24,6 +35,9 @@ def run(*arguments, cwd=None):
         (["--policy", "random", "--checkpoint", "full"], "--policy random takes no --checkpoint"),
         (["--policy", "random", "--split", "17/5"], "--split 17/5: choose one of"),
         (["--checkpoint", "nowhere"], "nowhere/config.json: no such file"),
+        (["--policy", "random", "--history"], "--policy random has no --history"),
+        (["--checkpoint", "a", "--checkpoint", "a"], "--checkpoint: a run is given twice"),
+        (["--checkpoint", "a", "--checkpoint", "b"], "several checkpoints need --out"),
         (["--policy", "random", "--out", "full"], "--out full: exists and is not empty"),
     ],
 )
@@ -49,3 +63,64 @@ def test_the_shortest_path_policy_scores_100(ithor, tmp_path):
     records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
     assert len(records) == 2000
     assert all(record["e"] == record["L"] == len(record["actions"]) for record in records)
+
+
+TINY = TrainConfig(
+    learner=LearnerConfig(num_envs=2),
+    network=NetworkConfig(width=8, hidden=8, precision="float32"),
+)
+
+
+@pytest.fixture(scope="module")
+def runs(ithor, glove, tmp_path_factory):
+    """Two runs of two seeds, each with two points of history that differ."""
+    out = tmp_path_factory.mktemp("runs")
+    task = make_task(TINY, ithor, glove)
+    weights = jax.jit(task.model.initialise)(jax.random.key(0), task.words)
+    for seed in (0, 1):
+        folder = out / f"seed{seed}"
+        folder.mkdir()
+        config = dataclasses.replace(TINY, seed=seed)
+        (folder / "config.json").write_text(json.dumps(configs.to_json(config)))
+        for k in (1, 2):
+            scaled = jax.tree.map(lambda x, by=k + seed: by * x, weights)
+            history.write(folder, Snapshot(scaled, 10 * k, 100 * k, 1.0, k, ithor.data_version))
+    return out
+
+
+def test_the_history_of_two_runs_gives_a_curve_and_all_records(runs, tmp_path):
+    out = tmp_path / "curve"
+    chosen = [f"--checkpoint={runs / name}" for name in ("seed0", "seed1")]
+    evaluate.main([*chosen, "--history", "--out", str(out)])
+    names = {"evaluations.json", "evaluations.md", "episodes.jsonl", "learning_curve.png"}
+    assert {path.name for path in out.iterdir()} == names
+    found = json.loads((out / "evaluations.json").read_text())
+    places = [(os.path.basename(r["run"]), r["point"], r["episodes_trained"]) for r in found]
+    assert places == [("seed0", 1, 100), ("seed0", 2, 200), ("seed1", 1, 100), ("seed1", 2, 200)]
+    assert [r["steps"] for r in found] == [400, 800, 400, 800]  # 2 environments, 20 steps
+    records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    assert len(records) == 4 * 2000
+    for result in found:
+        own = [
+            r["success"] for r in records
+            if (r["run"], r["updates"], r["group"]) == (result["run"], result["updates"], "unseen")
+        ]  # fmt: skip
+        assert result["unseen"]["L>=1"]["SR"] == pytest.approx(100 * sum(own) / 1000)
+
+
+def test_one_run_gives_the_files_of_a_single_result_beside_it(ithor, tmp_path):
+    run = shutil.copytree(OLD_RUN, tmp_path / "run")
+    evaluate.main(["--checkpoint", str(run), "--policy", "greedy"])
+    assert {path.name for path in (run / "greedy").iterdir()} == {
+        "results.json", "results.md", "episodes.jsonl"
+    }  # fmt: skip
+    out = json.loads((run / "greedy" / "results.json").read_text())
+    assert [out[k] for k in ("policy", "seed", "steps", "episodes_trained")] == ["greedy", 0, 16, 1]
+
+
+def test_a_run_without_history_is_named(runs, capsys, tmp_path):
+    (tmp_path / "config.json").write_text((runs / "seed0" / "config.json").read_text())
+    with pytest.raises(SystemExit):
+        evaluate.main([f"--checkpoint={tmp_path}", "--history"])
+    assert "history: no history" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]

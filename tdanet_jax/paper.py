@@ -1,0 +1,57 @@
+"""What the paper reports (Lian and Zhang, RA-L 2024, arXiv 2404.08353), to stand beside ours.
+
+The rows of its tables that are at hand, no more.
+Every place that shows one says that the worlds differ (`worlds`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+WORLDS_DIFFER = (
+    "The worlds differ: the paper used AI2-THOR 1.0.1 and its own test episodes; these rooms are "
+    "rebuilt from the metadata of a later version and have longer episodes on average."
+)
+
+
+def worlds(data: str | None) -> str:
+    """What to say beside the paper's rows; `data` is a file of rooms other than the bundled."""
+    return WORLDS_DIFFER if data is None else f"These rooms are those of {data}."
+
+
+class Rate(NamedTuple):
+    """SR and SPL in percent of one agent, on one group of targets, in one bucket of L."""
+
+    agent: str
+    split: str
+    group: str
+    bucket: str
+    sr: float
+    spl: float
+
+
+#: Table I. The paper trained for 6 M episodes.
+RATES = (
+    Rate("Random", "18/4", "seen", "L>=1", 11.2, 5.1),
+    Rate("TDANet", "18/4", "seen", "L>=1", 74.7, 29.7),
+    Rate("TDANet", "18/4", "unseen", "L>=1", 62.5, 25.3),
+)
+
+#: Parameters in units of 2^20, which is how the published tables count.
+PARAMETERS = {"TDANet": 3.08, "MJOLNIR-o": 3.42, "SSNet": 2.00}
+
+#: The paper's name of what is called otherwise here.
+NAMES = {
+    "tdanet": "TDANet",
+    "mjolnir-o": "MJOLNIR-o",
+    "ssnet": "SSNet",
+    "random": "Random",
+}
+
+
+def rates(split: str, group: str) -> Iterator[tuple[str, dict[str, Rate]]]:
+    """The agents of a table: name, and its rates by bucket."""
+    found = [rate for rate in RATES if (rate.split, rate.group) == (split, group)]
+    for agent in dict.fromkeys(rate.agent for rate in found):
+        yield agent, {rate.bucket: rate for rate in found if rate.agent == agent}
