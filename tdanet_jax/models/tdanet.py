@@ -103,6 +103,7 @@ class TDANetEncoder(Encoder):
         target = obs.target[..., None]
         logits = table.class_logits[target, obs.classes]
         logits += jnp.einsum("...i,...ki->...k", table.box_logits[obs.target], obs.boxes)
+        self.sow("intermediates", "correspondence", logits)
         return nn.softmax(logits, axis=-1, where=mask)
 
     def __call__(
@@ -122,6 +123,7 @@ class TDANetEncoder(Encoder):
         features = self.branch(jnp.concatenate([boxes, names], axis=-1))
         if self.siamese:
             features = jnp.abs(features - table.reference[obs.target])
+            self.sow("intermediates", "difference", features)
         if keep is not None and self.dropout > 0:
             features = jnp.where(keep, features / (1 - self.dropout), 0.0)
         if not self.siamese and not self.target_attention:

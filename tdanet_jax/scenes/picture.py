@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle, Wedge
 
 from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.geometry import HORIZONS, VIEWS, box_frame
+from tdanet_jax.scenes.floor_plan import area, footprint
+from tdanet_jax.scenes.geometry import HORIZONS, VIEWS
 from tdanet_jax.scenes.rules import RULES
 from tdanet_jax.scenes.scene import Scene
 from tdanet_jax.scenes.solids import void_boxes
@@ -71,14 +72,14 @@ def _draw_plan(
         axes.add_patch(Rectangle((box[0, 0], box[0, 2]), size[0], size[2], color="#e3e3e3", lw=0))
     spots = tables.position[:, [0, 2]]
     axes.scatter(spots[:, 0], spots[:, 1], s=7, color="#7fb77e", zorder=2)
-    order = sorted(range(len(scene.objects)), key=lambda k: -_area(scene, k))
+    order = sorted(range(len(scene.objects)), key=lambda k: -area(footprint(scene, k)))
     for k in order:
         color = {True: VISIBLE, False: SEEN, None: QUIET}[seen.get(k)]
         axes.add_patch(
-            Polygon(_footprint(scene, k), facecolor=color + "22", edgecolor=color, lw=0.9, zorder=3)
+            Polygon(footprint(scene, k), facecolor=color + "22", edgecolor=color, lw=0.9, zorder=3)
         )
-        if k in seen or _area(scene, k) > 0.15:
-            x, z = _footprint(scene, k).mean(axis=0)
+        if k in seen or area(footprint(scene, k)) > 0.15:
+            x, z = footprint(scene, k).mean(axis=0)
             name = scene.objects[k].object_class
             axes.text(x, z, name, fontsize=6, color=color, ha="center", va="center", zorder=5)
     (x, _, z), rotation, horizon = _pose(tables, state)
@@ -93,23 +94,6 @@ def _draw_plan(
         f"z {z:.2f}, rotation {rotation}, horizon {horizon}",
         fontsize=9,
     )
-
-
-def _footprint(scene: Scene, k: int) -> np.ndarray:
-    """Corners [4, 2] (x, z) of an object's box, of its oriented one where that stands upright."""
-    item = scene.objects[k]
-    origin, edges = box_frame(item.box, item.corners)
-    level = edges[np.abs(edges[:, 1]) < 1e-2]
-    if len(level) != 2:
-        origin, edges = box_frame(item.box, None)
-        level = edges[[0, 2]]
-    a, b = level
-    return np.array([origin, origin + a, origin + a + b, origin + b])[:, [0, 2]]
-
-
-def _area(scene: Scene, k: int) -> float:
-    a, b, _, d = _footprint(scene, k)
-    return float(abs(np.linalg.det([b - a, d - a])))
 
 
 def _draw_view(axes: Axes, tables: SceneTables, state: int) -> None:

@@ -1,0 +1,134 @@
+"""Shows what a trained agent attends to.
+
+    python -m experiments.attention --checkpoint runs/...
+    python -m experiments.attention --checkpoint runs/... --scene FloorPlan228 --target Laptop
+
+The first plays the fixed test episodes and writes into --out the mean attention by class pair
+(class_pairs.csv, .md, .png) and a picture of one episode; the second draws the chosen episode.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from experiments import one_episode
+from experiments.console import console, fail, fresh_file, one_line_errors, parse
+from experiments.one_episode import Choice
+
+if TYPE_CHECKING:
+    from tdanet_jax.episodes import Episodes
+    from tdanet_jax.evaluation import Records
+    from tdanet_jax.scenes import SceneTables
+    from tdanet_jax.trace import Player, Trace
+
+Played = Mapping[str, tuple["Episodes", "Records"]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Shows what a trained agent attends to."""
+
+    checkpoint: Path
+    """Folder of a run."""
+    choice: tyro.conf.OmitArgPrefixes[Choice]
+    out: Path | None = None
+    """Folder to write; by default <checkpoint>/attention."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command."""
+    command = parse(Command, arguments, prog="attention", description=__doc__)
+    with one_line_errors():
+        one_episode.check(command.choice, [command.checkpoint], required=False)
+        show(command)
+
+
+def show(command: Command) -> None:
+    """Plays, and writes the tables and pictures."""
+    from tdanet_jax import pictures
+
+    choice, out = command.choice, command.out or command.checkpoint / "attention"
+    tables = one_episode.load_tables()
+    player = one_episode.load_players([command.checkpoint], tables, choice.policy)[0]
+    if not player.attends:
+        fail(f"--checkpoint {command.checkpoint}: this model has no attention")
+    if choice.given:
+        trace = one_episode.play(choice, [command.checkpoint], [player], tables)[0]
+    else:
+        played = play_lists(player, tables, choice.seed)
+        write_pairs(player, tables, played, out)
+        trace = example(player, tables, played)
+    picture = out / f"{trace.scene}-{trace.target}.png"
+    with fresh_file(picture) as path:
+        title = f"{player.name}: {trace.target} in {trace.scene}"
+        pictures.attention_episode(trace, tables, title, path)
+    console.print(f"{trace.target} in {trace.scene}: {trace.outcome}")
+    console.print(f"wrote {picture}")
+
+
+def play_lists(player: Player, tables: SceneTables, seed: int) -> Played:
+    """The player's records of the fixed test episodes."""
+    from tdanet_jax import episodes, evaluation
+
+    lists = episodes.load(tables, player.task.split)
+    console.print(f"playing {sum(map(len, lists.values())):,} test episodes ...")
+    params = player.task.eval_params
+    return evaluation.evaluate_lists(player.policy, player.weights, params, lists, seed)
+
+
+def write_pairs(player: Player, tables: SceneTables, played: Played, out: Path) -> None:
+    """Writes the mean attention by class pair as a table, a page and a picture."""
+    import numpy as np
+
+    from tdanet_jax import attention, pictures, trace
+
+    assert player.model is not None
+    task = player.task
+    visits = [trace.visited(task.eval_params, *pair) for pair in played.values()]
+    pose, target = (np.concatenate(part) for part in zip(*visits, strict=True))
+    pairs = attention.class_pairs(
+        player.model,
+        player.weights,
+        task.words,
+        task.eval_params,
+        pose,
+        target,
+        tables.targets,
+        tables.classes,
+    )
+    unseen = {name for names in task.split.unseen.values() for name in names}
+    title = f"Attention of {player.name}, test episodes of split {task.split.name}"
+    with fresh_file(out / "class_pairs.csv") as path:
+        attention.write_csv(pairs, path)
+    with fresh_file(out / "class_pairs.md") as path:
+        path.write_text(attention.markdown(pairs, title, unseen))
+    with fresh_file(out / "class_pairs.png") as path:
+        pictures.class_pairs(pairs, unseen, title, path)
+    console.print(f"{len(pose):,} frames; wrote {out / 'class_pairs.csv'}, .md and .png")
+
+
+def example(player: Player, tables: SceneTables, played: Played) -> Trace:
+    """An episode to show: the first success with L >= 5, unseen targets first; else the first."""
+    import numpy as np
+
+    from tdanet_jax import trace
+    from tdanet_jax.episodes import Episodes
+
+    for wanted in (5, 1, 0):
+        for chosen, records in reversed(list(played.values())):
+            found = np.flatnonzero((records.shortest >= wanted) & (records.success | (wanted == 0)))
+            if len(found):
+                one = slice(found[0], found[0] + 1)
+                episode = Episodes(chosen.pose[one], chosen.target[one])
+                actions = records.actions[found[0], : records.length[found[0]]]
+                return trace.retrace(player, tables, episode, actions)
+    raise ValueError("no test episodes")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""What the commands that show one episode share: which episode, and who plays it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from experiments.console import console, fail, reporter
+from tdanet_jax import config as configs
+from tdanet_jax.config import CONFIG_FILE
+
+if TYPE_CHECKING:
+    from tdanet_jax.scenes import SceneTables
+    from tdanet_jax.trace import Player, Trace
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """Which episode to show."""
+
+    scene: str | None = None
+    """Room, say FloorPlan228; with --target."""
+    target: str | None = None
+    """Target class, say Laptop; with --scene."""
+    start: tuple[float, float, int] | None = None
+    """x and z in metres and rotation in degrees (a multiple of 45); the nearest reachable point is
+    taken. By default a start is drawn."""
+    episode: int | None = None
+    """Instead of a room and a target: an episode of the first checkpoint's episodes.jsonl, counted
+    from 0, as it was recorded. Other checkpoints play it anew."""
+    seed: int = 0
+    """Seed of the drawn start and of sampled actions."""
+    policy: Literal["sample", "greedy"] = "sample"
+    """How actions are chosen."""
+
+    @property
+    def given(self) -> bool:
+        """Whether an episode was chosen at all."""
+        return any(flag is not None for flag in (self.scene, self.target, self.start, self.episode))
+
+
+def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
+    """Ends the program, before anything is computed, if the flags do not choose one episode.
+
+    Args:
+      required: whether choosing none is wrong, too.
+    """
+    for run in runs:
+        configs.load(run / CONFIG_FILE)
+    if choice.episode is not None:
+        if (choice.scene, choice.target, choice.start) != (None, None, None):
+            fail("--episode takes no --scene, --target or --start")
+    elif (choice.scene is None or choice.target is None) and (required or choice.given):
+        fail("give --scene and --target, or --episode")
+
+
+def load_tables() -> SceneTables:
+    """The rooms, with progress if they have to be computed."""
+    from tdanet_jax import scenes
+
+    with reporter("rooms", every=30, transient=True) as report:
+        return scenes.load_tables(lambda done, total: report(done / total, "rebuilt"))
+
+
+def load_players(runs: Sequence[Path], tables: SceneTables, policy: str) -> list[Player]:
+    """The agents of some runs, each with a name of its own."""
+    from tdanet_jax import trace, words
+
+    vectors = words.load_bundled()
+    players = [trace.load_player(run, tables, vectors, policy == "greedy") for run in runs]
+    names = [player.name for player in players]
+    return [
+        player if names.count(player.name) == 1 else dataclasses.replace(player, name=str(run))
+        for player, run in zip(players, runs, strict=True)
+    ]
+
+
+def play(
+    choice: Choice, runs: Sequence[Path], players: Sequence[Player], tables: SceneTables
+) -> list[Trace]:
+    """Each player's trace of the chosen episode; players[0] is the agent of runs[0]."""
+    from tdanet_jax import episode_lookup, trace
+
+    if choice.episode is not None:
+        recorded = episode_lookup.read_record(runs[0], choice.episode, tables)
+        again = trace.retrace(players[0], tables, recorded.episode, recorded.actions)
+        if again.success != recorded.success:
+            fail(f"--episode {choice.episode}: recorded on other scene tables")
+        others = players[1:]
+        return [again, *(trace.play(p, tables, recorded.episode, choice.seed) for p in others)]
+    assert choice.scene is not None
+    assert choice.target is not None
+    start = None if choice.start is None else episode_lookup.Start(*choice.start)
+    episode = episode_lookup.find(tables, choice.scene, choice.target, start, choice.seed)
+    return [trace.play(player, tables, episode, choice.seed) for player in players]
+
+
+def play_runs(
+    choice: Choice, runs: Sequence[Path], tables: SceneTables, shortest: bool
+) -> list[Trace]:
+    """`play` for the agents of some runs; behind them the shortest path, if asked for."""
+    from tdanet_jax import trace
+
+    players = load_players(runs, tables, choice.policy)
+    if shortest:
+        players.append(trace.Player("shortest path", players[0].task))
+    return play(choice, runs, players, tables)
+
+
+def tell(traces: Sequence[Trace], out: Path) -> None:
+    """Prints how it went, and what was written."""
+    first = traces[0]
+    console.print(f"{first.target} in {first.scene}")
+    for trace in traces:
+        console.print(f"  {trace.player}: {trace.outcome}")
+    console.print(f"wrote {out}")

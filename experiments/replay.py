@@ -1,0 +1,55 @@
+"""Writes an episode as one HTML page that needs nothing beside itself.
+
+    python -m experiments.replay --checkpoint runs/... --scene FloorPlan228 --target Laptop
+
+Floor plan and path, what the agent sees and attends to, action probabilities and value, step by
+step; several checkpoints side by side.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import tyro
+
+from experiments import one_episode
+from experiments.console import fresh_file, one_line_errors, parse
+from experiments.one_episode import Choice
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Writes an episode as one HTML page that needs nothing beside itself."""
+
+    checkpoint: tyro.conf.UseAppendAction[tuple[Path, ...]]
+    """Folder of a run; repeat the flag to see several side by side."""
+    choice: tyro.conf.OmitArgPrefixes[Choice]
+    shortest: bool = False
+    """Also show the shortest path."""
+    out: Path = Path("replay.html")
+    """Page to write."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command."""
+    command = parse(Command, arguments, prog="replay", description=__doc__)
+    with one_line_errors():
+        one_episode.check(command.choice, command.checkpoint)
+        write(command)
+
+
+def write(command: Command) -> None:
+    """Plays the episode and writes the page."""
+    from tdanet_jax import replay
+
+    tables = one_episode.load_tables()
+    traces = one_episode.play_runs(command.choice, command.checkpoint, tables, command.shortest)
+    page = replay.page(traces, tables)
+    with fresh_file(command.out) as path:
+        path.write_text(page, encoding="utf-8")
+    one_episode.tell(traces, command.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""Draws the way of one or several agents through the same episode, from above.
+
+python -m experiments.trajectories --checkpoint runs/A --checkpoint runs/B \\
+    --scene FloorPlan228 --target Laptop --out trajectories.png
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import tyro
+
+from experiments import one_episode
+from experiments.console import fresh_file, one_line_errors, parse
+from experiments.one_episode import Choice
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Draws the way of one or several agents through the same episode, from above."""
+
+    checkpoint: tyro.conf.UseAppendAction[tuple[Path, ...]]
+    """Folder of a run; repeat the flag to see several side by side."""
+    choice: tyro.conf.OmitArgPrefixes[Choice]
+    shortest: bool = False
+    """Also draw the shortest path."""
+    out: Path = Path("trajectories.png")
+    """Picture to write (png, pdf, svg)."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command."""
+    command = parse(Command, arguments, prog="trajectories", description=__doc__)
+    with one_line_errors():
+        one_episode.check(command.choice, command.checkpoint)
+        write(command)
+
+
+def write(command: Command) -> None:
+    """Plays the episode and draws it."""
+    from tdanet_jax import pictures
+    from tdanet_jax.scenes import floor_plan
+
+    tables = one_episode.load_tables()
+    traces = one_episode.play_runs(command.choice, command.checkpoint, tables, command.shortest)
+    with fresh_file(command.out) as path:
+        pictures.trajectories(traces, floor_plan.load(tables, traces[0].scene), tables, path)
+    one_episode.tell(traces, command.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,271 @@
+"""An episode step by step: where an agent went, what was in view, and what its network made of it.
+
+A trace is made from actions that were already taken, be it by `evaluation.evaluate` or read from a
+run's `episodes.jsonl`: they lead through the same poses again, and the network is asked at each of
+them, with the memory that it had there. So a recorded episode is shown as it happened.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tdanet_jax import attention, env, evaluation, policies
+from tdanet_jax import config as configs
+from tdanet_jax.checkpoint import FOLDER, Checkpoints
+from tdanet_jax.config import CONFIG_FILE
+from tdanet_jax.env import EnvParams
+from tdanet_jax.episodes import Episodes
+from tdanet_jax.evaluation import Records
+from tdanet_jax.models import actor_critic
+from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.policies import Policy
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.task import Task, make_model, make_task
+from tdanet_jax.vocabulary import NUM_ACTIONS, Action
+from tdanet_jax.words import WordVectors
+
+
+@dataclasses.dataclass(frozen=True)
+class Player:
+    """Who plays: a trained network, or the shortest path if there is no network.
+
+    Attributes:
+      name: what pictures call it.
+      task: the rooms as its configuration shows them.
+      model, weights: the network, or None.
+      greedy: takes the most probable action instead of sampling one.
+    """
+
+    name: str
+    task: Task
+    model: ActorCritic | None = None
+    weights: Any = None
+    greedy: bool = False
+
+    @property
+    def policy(self) -> Policy:
+        """How it chooses its actions."""
+        if self.model is None:
+            return policies.shortest_path()
+        return policies.network(self.model, self.task.words, self.greedy)
+
+    @property
+    def attends(self) -> bool:
+        """Whether the network has weights over the detections."""
+        if self.model is None:
+            return False
+        one, task = jnp.zeros(1, jnp.int32), self.task
+        arguments = (self.weights, task.words, task.eval_params, one, one)
+        shapes = jax.eval_shape(functools.partial(attention.look, self.model), *arguments)
+        return shapes[1].attention is not None
+
+
+def load_player(
+    run: Path | str, tables: SceneTables, vectors: WordVectors, greedy: bool = False
+) -> Player:
+    """The agent of a training run on the given rooms, named like the run's folder.
+
+    Raises:
+      ValueError: the folder holds no run, or its checkpoint cannot be read.
+    """
+    run = Path(run)
+    config = configs.load(run / CONFIG_FILE)
+    if not (run / FOLDER).is_dir():
+        raise ValueError(f"{run / FOLDER}: no checkpoint")
+    task = make_task(config, tables, vectors)
+    weights = Checkpoints(run).weights()
+    return Player(run.resolve().name, task, make_model(config.network), weights, greedy)
+
+
+@dataclasses.dataclass(frozen=True)
+class Trace:
+    """One player's episode of T actions. What a player does not have is None.
+
+    Attributes:
+      player: its name.
+      scene, target: names.
+      pose: [T + 1] int, before each action and at the end, in the full tables.
+      actions: [T] int.
+      success: Done with the target visible.
+      shortest: L, actions on the optimal path with Done.
+      probabilities: [T, 6], of the actions.
+      value: [T], expected discounted return.
+      attention: T arrays [n], weight of each of the n objects in view, in the tables' order. Where
+        the network sees a row per class, every object of the class has the row's weight.
+      correspondence: the same, before the softmax of Eq. 1.
+      difference: [T], mean over the units of Eq. 2's absolute difference.
+    """
+
+    player: str
+    scene: str
+    target: str
+    pose: np.ndarray
+    actions: np.ndarray
+    success: bool
+    shortest: int
+    probabilities: np.ndarray | None = None
+    value: np.ndarray | None = None
+    attention: tuple[np.ndarray, ...] | None = None
+    correspondence: tuple[np.ndarray, ...] | None = None
+    difference: np.ndarray | None = None
+
+    @property
+    def outcome(self) -> str:
+        """How it ended, in words."""
+        count = len(self.actions)
+        if self.success:
+            how = "success"
+        elif self.actions[-1] == Action.DONE:
+            how = "failure (Done without the target)"
+        else:
+            how = "failure (step limit)"
+        return f"{how}, {count} action{'s'[: count != 1]}, shortest {self.shortest}"
+
+
+class View(NamedTuple):
+    """The n objects in view from a pose, in the tables' order."""
+
+    classes: tuple[str, ...]
+    boxes: np.ndarray  # [n, 4] x1, y1, x2, y2 as shares of the image, y down
+    within_reach: np.ndarray  # [n] bool, visible as the task says it: within 1.5 m
+
+
+def view(tables: SceneTables, pose: int) -> View:
+    """What is in view from a pose."""
+    rows = slice(tables.row_start[pose], tables.row_start[pose + 1])
+    return View(
+        classes=tuple(tables.classes[c] for c in tables.row_class[rows]),
+        boxes=tables.row_box[rows] / (tables.image * tables.subpixel),
+        within_reach=tables.row_visible[rows],
+    )
+
+
+def play(player: Player, tables: SceneTables, episode: Episodes, seed: int = 0) -> Trace:
+    """Lets the player play one episode to its end. Equal seeds, equal actions."""
+    params, key = player.task.eval_params, jax.random.key(seed)
+    records = evaluation.evaluate(player.policy, player.weights, params, episode, key)
+    return retrace(player, tables, episode, records.actions[0, : records.length[0]])
+
+
+def retrace(player: Player, tables: SceneTables, episode: Episodes, actions: np.ndarray) -> Trace:
+    """The trace of actions [T] that were taken in an episode."""
+    pose = follow(player.task.eval_params, episode, actions[None])[0]
+    goal = int(episode.target[0])
+    trace = Trace(
+        player=player.name,
+        scene=tables.scenes[tables.position_scene[pose[0] >> 4]],
+        target=tables.targets[goal],
+        pose=pose,
+        actions=np.asarray(actions, int),
+        success=bool(actions[-1] == Action.DONE and tables.distance[pose[-1], goal] == 0),
+        shortest=int(tables.distance[pose[0], goal]) + 1,
+    )
+    return trace if player.model is None else _think(player, tables, trace, goal)
+
+
+def follow(params: EnvParams, episodes: Episodes, actions: np.ndarray) -> np.ndarray:
+    """Poses [E, N + 1] before each of the actions [E, N] and at the end; -1 is no action."""
+    return np.asarray(_follow(params, jnp.asarray(episodes.pose), jnp.asarray(actions)))
+
+
+@jax.jit
+def _follow(params: EnvParams, pose: jax.Array, actions: jax.Array) -> jax.Array:
+    move = jax.vmap(env.move, (None, 0, 0))
+
+    def step(pose: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        after = jnp.where(action < 0, pose, move(params, pose, action))
+        return after, after
+
+    _, after = jax.lax.scan(step, pose, actions.T)
+    return jnp.concatenate([pose[None], after]).T
+
+
+def visited(
+    params: EnvParams, episodes: Episodes, records: Records
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pose and target [N] of every frame in which an action was chosen."""
+    taken = records.actions >= 0
+    pose = follow(params, episodes, records.actions)[:, :-1][taken]
+    return pose, np.repeat(episodes.target, taken.sum(axis=1))
+
+
+#: Steps are padded to multiples of this, so that few shapes are ever compiled.
+STEP_BLOCK = 50
+
+
+def _think(player: Player, tables: SceneTables, trace: Trace, goal: int) -> Trace:
+    """The trace with what the network made of every step."""
+    count = len(trace.actions)
+    padded = np.resize(trace.pose[:-1], -(-count // STEP_BLOCK) * STEP_BLOCK)
+    task = player.task
+    thoughts = _thoughts(
+        player.model, player.weights, task.words, task.eval_params, padded, np.int32(goal)
+    )
+    steps = jax.tree.map(lambda x: np.asarray(x, np.float64)[:count], thoughts)
+    rows = [_rows_of_objects(task.eval_params, tables, pose) for pose in trace.pose[:-1]]
+
+    def by_object(values: np.ndarray | None) -> tuple[np.ndarray, ...] | None:
+        if values is None:
+            return None
+        return tuple(value[row] for value, row in zip(values, rows, strict=True))
+
+    return dataclasses.replace(
+        trace,
+        probabilities=steps.probabilities,
+        value=steps.value,
+        attention=by_object(steps.attention),
+        correspondence=by_object(steps.correspondence),
+        difference=steps.difference,
+    )
+
+
+def _rows_of_objects(params: EnvParams, tables: SceneTables, pose: int) -> np.ndarray:
+    """The observation's row of each of the n objects in view: [n] int."""
+    classes = tables.row_class[tables.row_start[pose] : tables.row_start[pose + 1]]
+    if int(params.row_start[pose + 1] - params.row_start[pose]) == len(classes):
+        return np.arange(len(classes))
+    return np.unique(classes, return_inverse=True)[1]  # rows are one a class, in the same order
+
+
+class _Thoughts(NamedTuple):
+    """What a network makes of each step [N]."""
+
+    probabilities: jax.Array  # [N, 6]
+    value: jax.Array  # [N]
+    attention: jax.Array | None  # [N, K]
+    correspondence: jax.Array | None  # [N, K]
+    difference: jax.Array | None  # [N]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _thoughts(
+    model: ActorCritic,
+    weights: Any,
+    words: jax.Array,
+    params: EnvParams,
+    pose: jax.Array,
+    target: jax.Array,
+) -> _Thoughts:
+    table = actor_critic.prepare(model, weights, words)
+
+    def step(memory: tuple, pose: jax.Array) -> tuple[tuple, _Thoughts]:
+        carry, previous, fresh = memory
+        state = env.start(params, pose, target)
+        obs = jax.tree.map(lambda x: x[None], env.observe(state, params))
+        carry, out, look = attention.forward(model, weights, table, carry, obs, previous, fresh)
+        probabilities = jax.nn.softmax(out.logits)
+        difference = None if look.difference is None else look.difference.mean(-1)
+        thoughts = _Thoughts(
+            probabilities, out.value, look.attention, look.correspondence, difference
+        )
+        return (carry, probabilities, jnp.zeros(1, bool)), jax.tree.map(lambda x: x[0], thoughts)
+
+    memory = model.initial_carry(1), jnp.zeros((1, NUM_ACTIONS)), jnp.ones(1, bool)
+    return jax.lax.scan(step, memory, pose)[1]
