@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from experiments import one_episode
-from experiments.console import console, fail, fresh_file, one_line_errors, parse
+from experiments.console import console, fail, one_line_errors, parse
 from experiments.one_episode import Choice
 
 if TYPE_CHECKING:
@@ -50,11 +50,15 @@ def main(arguments: list[str] | None = None) -> None:
 
 def show(command: Command) -> None:
     """Plays, and writes the tables and pictures."""
-    from tdanet_jax import pictures
+    from tdanet_jax import files, pictures
 
-    choice, out = command.choice, command.out or command.checkpoint / "attention"
-    tables = one_episode.load_tables()
-    player = one_episode.load_players([command.checkpoint], tables, choice.policy)[0]
+    choice, out = (
+        command.choice,
+        command.out or one_episode.folder_of(command.checkpoint) / "attention",
+    )
+    rooms = one_episode.load_rooms(choice, [command.checkpoint])
+    player = one_episode.load_players([command.checkpoint], rooms, choice.policy)[0]
+    tables = rooms.tables
     if not player.attends:
         fail(f"--checkpoint {command.checkpoint}: this model has no attention")
     if choice.given:
@@ -63,8 +67,9 @@ def show(command: Command) -> None:
         played = play_lists(player, tables, choice.seed)
         write_pairs(player, tables, played, out)
         trace = example(player, tables, played)
+    out.mkdir(parents=True, exist_ok=True)
     picture = out / f"{trace.scene}-{trace.target}.png"
-    with fresh_file(picture) as path:
+    with files.replacing(picture) as path:
         title = f"{player.name}: {trace.target} in {trace.scene}"
         pictures.attention_episode(trace, tables, title, path)
     console.print(f"{trace.target} in {trace.scene}: {trace.outcome}")
@@ -75,7 +80,7 @@ def play_lists(player: Player, tables: SceneTables, seed: int) -> Played:
     """The player's records of the fixed test episodes."""
     from tdanet_jax import episodes, evaluation
 
-    lists = episodes.load(tables, player.task.split)
+    lists = episodes.load(tables, player.task.split, player.task.extras)
     console.print(f"playing {sum(map(len, lists.values())):,} test episodes ...")
     params = player.task.eval_params
     return evaluation.evaluate_lists(player.policy, player.weights, params, lists, seed)
@@ -85,7 +90,7 @@ def write_pairs(player: Player, tables: SceneTables, played: Played, out: Path) 
     """Writes the mean attention by class pair as a table, a page and a picture."""
     import numpy as np
 
-    from tdanet_jax import attention, pictures, trace
+    from tdanet_jax import attention, files, pictures, trace
 
     assert player.model is not None
     task = player.task
@@ -102,12 +107,13 @@ def write_pairs(player: Player, tables: SceneTables, played: Played, out: Path) 
         tables.classes,
     )
     unseen = {name for names in task.split.unseen.values() for name in names}
+    out.mkdir(parents=True, exist_ok=True)
     title = f"Attention of {player.name}, test episodes of split {task.split.name}"
-    with fresh_file(out / "class_pairs.csv") as path:
+    with files.replacing(out / "class_pairs.csv") as path:
         attention.write_csv(pairs, path)
-    with fresh_file(out / "class_pairs.md") as path:
+    with files.replacing(out / "class_pairs.md") as path:
         path.write_text(attention.markdown(pairs, title, unseen))
-    with fresh_file(out / "class_pairs.png") as path:
+    with files.replacing(out / "class_pairs.png") as path:
         pictures.class_pairs(pairs, unseen, title, path)
     console.print(f"{len(pose):,} frames; wrote {out / 'class_pairs.csv'}, .md and .png")
 

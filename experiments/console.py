@@ -5,11 +5,9 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
-import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import tyro
@@ -63,18 +61,6 @@ def one_line_errors() -> Iterator[None]:
         yield
     except (ValueError, OSError) as error:
         fail(error)
-
-
-@contextlib.contextmanager
-def fresh_file(path: Path) -> Iterator[Path]:
-    """A path to write to; what was written takes the place of `path`, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_name(f".{os.getpid()}.{path.name}")  # the ending tells pictures their format
-    try:
-        yield fresh
-        os.replace(fresh, path)
-    finally:
-        fresh.unlink(missing_ok=True)
 
 
 class StopRequest:

@@ -13,6 +13,7 @@ from tdanet_jax.config import CONFIG_FILE
 
 if TYPE_CHECKING:
     from tdanet_jax.scenes import SceneTables
+    from tdanet_jax.scenes.dataset import Rooms
     from tdanet_jax.trace import Player, Trace
 
 
@@ -32,6 +33,8 @@ class Choice:
     from 0, as it was recorded. Other checkpoints play it anew."""
     seed: int = 0
     """Seed of the drawn start and of sampled actions."""
+    data: str | None = None
+    """File of rooms that `experiments.scenes import` wrote, in place of those of the first run."""
     policy: Literal["sample", "greedy"] = "sample"
     """How actions are chosen."""
 
@@ -48,7 +51,7 @@ def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
       required: whether choosing none is wrong, too.
     """
     for run in runs:
-        configs.load(run / CONFIG_FILE)
+        configs.load(folder_of(run) / CONFIG_FILE)
     if choice.episode is not None:
         if (choice.scene, choice.target, choice.start) != (None, None, None):
             fail("--episode takes no --scene, --target or --start")
@@ -56,20 +59,27 @@ def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
         fail("give --scene and --target, or --episode")
 
 
-def load_tables() -> SceneTables:
-    """The rooms, with progress if they have to be computed."""
-    from tdanet_jax import scenes
+def folder_of(run: Path) -> Path:
+    """The folder of a run, also of a point of its history (`history/<updates>.npz`)."""
+    return run.parent.parent if run.suffix == ".npz" else run
 
+
+def load_rooms(choice: Choice, runs: Sequence[Path]) -> Rooms:
+    """The rooms of `--data`, else those of the first run, with progress if they are rebuilt."""
+    from tdanet_jax.scenes import dataset
+
+    data = choice.data
+    if data is None:
+        data = configs.load(folder_of(runs[0]) / CONFIG_FILE).data
     with reporter("rooms", every=30, transient=True) as report:
-        return scenes.load_tables(lambda done, total: report(done / total, "rebuilt"))
+        return dataset.load_rooms(data, lambda done, total: report(done / total, "rebuilt"))
 
 
-def load_players(runs: Sequence[Path], tables: SceneTables, policy: str) -> list[Player]:
+def load_players(runs: Sequence[Path], rooms: Rooms, policy: str) -> list[Player]:
     """The agents of some runs, each with a name of its own."""
-    from tdanet_jax import trace, words
+    from tdanet_jax import trace
 
-    vectors = words.load_bundled()
-    players = [trace.load_player(run, tables, vectors, policy == "greedy") for run in runs]
+    players = [trace.load_player(run, rooms, policy == "greedy") for run in runs]
     names = [player.name for player in players]
     return [
         player if names.count(player.name) == 1 else dataclasses.replace(player, name=str(run))
@@ -84,7 +94,7 @@ def play(
     from tdanet_jax import episode_lookup, trace
 
     if choice.episode is not None:
-        recorded = episode_lookup.read_record(runs[0], choice.episode, tables)
+        recorded = episode_lookup.read_record(folder_of(runs[0]), choice.episode, tables)
         again = trace.retrace(players[0], tables, recorded.episode, recorded.actions)
         if again.success != recorded.success:
             fail(f"--episode {choice.episode}: recorded on other scene tables")
@@ -97,16 +107,14 @@ def play(
     return [trace.play(player, tables, episode, choice.seed) for player in players]
 
 
-def play_runs(
-    choice: Choice, runs: Sequence[Path], tables: SceneTables, shortest: bool
-) -> list[Trace]:
+def play_runs(choice: Choice, runs: Sequence[Path], rooms: Rooms, shortest: bool) -> list[Trace]:
     """`play` for the agents of some runs; behind them the shortest path, if asked for."""
     from tdanet_jax import trace
 
-    players = load_players(runs, tables, choice.policy)
+    players = load_players(runs, rooms, choice.policy)
     if shortest:
         players.append(trace.Player("shortest path", players[0].task))
-    return play(choice, runs, players, tables)
+    return play(choice, runs, players, rooms.tables)
 
 
 def tell(traces: Sequence[Trace], out: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import tyro
 
 from experiments import one_episode
-from experiments.console import fresh_file, one_line_errors, parse
+from experiments.console import one_line_errors, parse
 from experiments.one_episode import Choice
 
 
@@ -41,13 +41,14 @@ def main(arguments: list[str] | None = None) -> None:
 
 def write(command: Command) -> None:
     """Plays the episode and writes the page."""
-    from tdanet_jax import replay
+    from tdanet_jax import files, replay
 
-    tables = one_episode.load_tables()
-    traces = one_episode.play_runs(command.choice, command.checkpoint, tables, command.shortest)
-    page = replay.page(traces, tables)
-    with fresh_file(command.out) as path:
-        path.write_text(page, encoding="utf-8")
+    choice, runs = command.choice, command.checkpoint
+    rooms = one_episode.load_rooms(choice, runs)
+    traces = one_episode.play_runs(choice, runs, rooms, command.shortest)
+    page = replay.page(traces, rooms.tables)
+    command.out.parent.mkdir(parents=True, exist_ok=True)
+    files.write_text(command.out, page)
     one_episode.tell(traces, command.out)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import tyro
 
 from experiments import one_episode
-from experiments.console import fresh_file, one_line_errors, parse
+from experiments.console import one_line_errors, parse
 from experiments.one_episode import Choice
 
 
@@ -39,13 +39,16 @@ def main(arguments: list[str] | None = None) -> None:
 
 def write(command: Command) -> None:
     """Plays the episode and draws it."""
-    from tdanet_jax import pictures
+    from tdanet_jax import files, pictures
     from tdanet_jax.scenes import floor_plan
 
-    tables = one_episode.load_tables()
-    traces = one_episode.play_runs(command.choice, command.checkpoint, tables, command.shortest)
-    with fresh_file(command.out) as path:
-        pictures.trajectories(traces, floor_plan.load(tables, traces[0].scene), tables, path)
+    choice, runs = command.choice, command.checkpoint
+    rooms = one_episode.load_rooms(choice, runs)
+    traces = one_episode.play_runs(choice, runs, rooms, command.shortest)
+    plan = floor_plan.load(rooms.tables, traces[0].scene)
+    command.out.parent.mkdir(parents=True, exist_ok=True)
+    with files.replacing(command.out) as path:
+        pictures.trajectories(traces, plan, rooms.tables, path)
     one_episode.tell(traces, command.out)
 
 

@@ -199,6 +199,13 @@ def load(run: Path | str) -> Agent:
     Raises:
       ValueError: the folder holds no run, or its checkpoint cannot be read.
     """
+    config, weights, classes = read(run)
+    vectors = word_vectors.load(config.word_vectors, classes.names)
+    return Agent(config, weights, vectors, classes)
+
+
+def read(run: Path | str) -> tuple[TrainConfig, Any, Classes]:
+    """What `load` makes an agent of: configuration, parameters, vocabulary."""
     path = Path(run)
     point = path.suffix == history.SUFFIX
     folder = path.parent.parent if point else path
@@ -206,6 +213,4 @@ def load(run: Path | str) -> Agent:
     if not point and not (folder / FOLDER).is_dir():
         raise ValueError(f"{folder / FOLDER}: no checkpoint")
     weights = history.read(path).weights if point else Checkpoints(folder).weights()
-    classes = vocabularies.load(folder)
-    vectors = word_vectors.load(config.word_vectors, classes.names)
-    return Agent(config, weights, vectors, classes)
+    return config, weights, vocabularies.load(folder)

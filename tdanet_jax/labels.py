@@ -12,7 +12,7 @@ from tdanet_jax.scenes.floor_plan import FloorPlan
 from tdanet_jax.trace import View
 
 #: Mean advance of a letter and height of a line, in units of the font's size; on the wide side.
-LETTER, LINE = 0.6, 1.15
+LETTER, LINE = 0.63, 1.15
 
 Rectangle = tuple[float, float, float, float]  # x1, y1, x2, y2, y down
 
@@ -130,8 +130,12 @@ def of_view(view: View, attention: np.ndarray | None, target: str) -> list[Label
     return [label._replace(of=chosen[label.of]) for label in placed]
 
 
-def of_plan(plan: FloorPlan, target: str) -> list[Label]:
-    """Names of the targets and of the largest object of each class; metres, y is minus z."""
+def of_plan(plan: FloorPlan, target: str, scale: float = 1.0) -> list[Label]:
+    """Names of the targets and of the largest object of each class; metres, y is minus z.
+
+    Args:
+      scale: of the font.
+    """
     x1, z1, x2, z2 = plan.extent
     order = sorted(range(len(plan.classes)), key=lambda i: plan.classes[i] != target)
     chosen, things, named = [], [], {"Floor"}
@@ -143,7 +147,7 @@ def of_plan(plan: FloorPlan, target: str) -> list[Label]:
         (left, low), (right, high) = outline.min(axis=0), outline.max(axis=0)
         chosen.append(i)
         things.append((name, (float(left), float(-high), float(right), float(-low))))
-    placed = place(things, plan_font(plan), (x1, -z2, x2, -z1), centred=True)
+    placed = place(things, scale * plan_font(plan), (x1, -z2, x2, -z1), centred=True)
     return [label._replace(of=chosen[label.of]) for label in placed]
 
 

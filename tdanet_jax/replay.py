@@ -21,6 +21,8 @@ TEMPLATE = "replay.html"
 SLOT = "{{EPISODE}}"
 #: Units of the page's drawings: of the camera's image, and of a metre on the plan.
 IMAGE, METRE = 300, 100
+#: Scale of a plan's font where several players leave it less room.
+SMALL_PLAN = 1.3
 
 
 def page(traces: Sequence[Trace], tables: SceneTables) -> str:
@@ -40,7 +42,7 @@ def page(traces: Sequence[Trace], tables: SceneTables) -> str:
         "target": first.target,
         "shortest": first.shortest,
         "actions": ACTION_NAMES,
-        "plan": _plan(plan, first.target),
+        "plan": _plan(plan, first.target, SMALL_PLAN if len(traces) > 1 else 1.0),
         "players": [_player(trace, tables) for trace in traces],
     }
     template = importlib.resources.files("tdanet_jax").joinpath(TEMPLATE).read_text("utf-8")
@@ -55,13 +57,13 @@ def embed(value: Any) -> str:
     return text
 
 
-def _plan(plan: FloorPlan, target: str) -> dict[str, Any]:
+def _plan(plan: FloorPlan, target: str, scale: float) -> dict[str, Any]:
     """The room in centimetres, y down (minus z)."""
     x1, z1, x2, z2 = plan.extent
     flip = np.array([METRE, -METRE])
     return {
         "extent": [round(METRE * v) for v in (x1, -z2, x2 - x1, z2 - z1)],
-        "font": round(METRE * labels.plan_font(plan), 1),
+        "font": round(scale * METRE * labels.plan_font(plan), 1),
         "points": _rounded(plan.points * flip),
         "outlines": [
             {"name": name, "corners": _rounded(corners * flip)}
@@ -69,7 +71,7 @@ def _plan(plan: FloorPlan, target: str) -> dict[str, Any]:
         ],
         "labels": [
             [label.text, round(METRE * label.x), round(METRE * label.y), plan.classes[label.of]]
-            for label in labels.of_plan(plan, target)
+            for label in labels.of_plan(plan, target, scale)
         ],
     }
 

@@ -16,20 +16,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tdanet_jax import attention, env, evaluation, policies
-from tdanet_jax import config as configs
-from tdanet_jax.checkpoint import FOLDER, Checkpoints
-from tdanet_jax.config import CONFIG_FILE
+from tdanet_jax import agent, attention, env, evaluation, policies
+from tdanet_jax import words as word_vectors
 from tdanet_jax.env import EnvParams
 from tdanet_jax.episodes import Episodes
 from tdanet_jax.evaluation import Records
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.policies import Policy
+from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.task import Task, make_model, make_task
+from tdanet_jax.task import Task, make_task
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action
-from tdanet_jax.words import WordVectors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,9 +47,9 @@ class Player:
     weights: Any = None
     greedy: bool = False
 
-    @property
+    @functools.cached_property
     def policy(self) -> Policy:
-        """How it chooses its actions."""
+        """How it chooses its actions; one object, so that it is compiled once."""
         if self.model is None:
             return policies.shortest_path()
         return policies.network(self.model, self.task.words, self.greedy)
@@ -67,21 +65,25 @@ class Player:
         return shapes[1].attention is not None
 
 
-def load_player(
-    run: Path | str, tables: SceneTables, vectors: WordVectors, greedy: bool = False
-) -> Player:
-    """The agent of a training run on the given rooms, named like the run's folder.
+def load_player(run: Path | str, rooms: Rooms, greedy: bool = False) -> Player:
+    """The agent of a training run, or of a point of its history, on the given rooms.
+
+    Returns:
+      A player with the name of the run's folder, or of the point.
 
     Raises:
-      ValueError: the folder holds no run, or its checkpoint cannot be read.
+      ValueError: the folder holds no run, its checkpoint cannot be read, or the network knows
+        classes by number and the rooms have others.
     """
-    run = Path(run)
-    config = configs.load(run / CONFIG_FILE)
-    if not (run / FOLDER).is_dir():
-        raise ValueError(f"{run / FOLDER}: no checkpoint")
-    task = make_task(config, tables, vectors)
-    weights = Checkpoints(run).weights()
-    return Player(run.resolve().name, task, make_model(config.network), weights, greedy)
+    config, weights, classes = agent.read(run)
+    tables = rooms.tables
+    vectors = word_vectors.load(config.word_vectors, tables.classes)
+    task = make_task(config, tables, vectors, rooms.extras)
+    encoder = task.model.encoder
+    numbered = encoder.ROWS == "class" or encoder.IMAGE
+    if numbered and classes.names and classes.names != tables.classes:
+        raise ValueError(f"{run}: {config.model} knows the classes of its own rooms alone")
+    return Player(Path(run).resolve().name, task, task.model, weights, greedy)
 
 
 @dataclasses.dataclass(frozen=True)

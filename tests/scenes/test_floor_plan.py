@@ -1,0 +1,48 @@
+"""Floor plans: every object's outline, oriented where that is known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tdanet_jax.scenes import SceneError, floor_plan, tables, toy
+
+
+def test_outlines_of_the_boxes_of_a_room_of_ones_own():
+    mug = toy.thing("Mug", (1.0, 1.0, 2.0), (0.2, 0.1, 0.4))
+    sofa = toy.thing("Sofa", (-1.0, 0.5, 0.0), (1.0, 1.0, 2.0))
+    built = tables.build([toy.room(toy.line(3), mug, sofa)])
+    plan = floor_plan.load(built, "Toy")
+    assert plan.classes == ("Sofa", "Mug")  # largest first
+    np.testing.assert_allclose(plan.outlines[1].min(axis=0), (0.9, 1.8))
+    np.testing.assert_allclose(plan.outlines[1].max(axis=0), (1.1, 2.2))
+    assert floor_plan.area(plan.outlines[0]) == pytest.approx(2.0)
+    np.testing.assert_allclose(plan.points, [(0, 0), (0, 0.25), (0, 0.5)])
+    np.testing.assert_allclose(plan.extent, (-1.625, -1.125, 1.225, 2.325))
+
+
+def test_objects_without_a_box_are_left_out():
+    built = tables.build([toy.corridor()])
+    boxes = np.full_like(built.object_box, np.nan)
+    plan = floor_plan.load(dataclasses.replace(built, object_box=boxes), "Corridor")
+    assert plan.classes == ()
+    np.testing.assert_allclose(plan.extent, (-0.125, -0.125, 0.125, 1.125))
+
+
+def test_bundled_rooms_have_oriented_outlines_inside_their_boxes(ithor):
+    plan = floor_plan.load(ithor, "FloorPlan228")
+    own = ithor.object_scene == ithor.scenes.index("FloorPlan228")
+    assert sorted(plan.classes) == sorted(ithor.classes[c] for c in ithor.object_class[own])
+    slanted = 0
+    boxes = ithor.object_box[own]
+    for outline in plan.outlines:
+        low, high = outline.min(axis=0), outline.max(axis=0)
+        inside = (boxes[:, [0, 2]] <= low + 0.02) & (boxes[:, [3, 5]] >= high - 0.02)
+        assert inside.all(axis=1).any()
+        slanted += floor_plan.area(outline) < 0.95 * np.prod(high - low)
+    assert slanted > 3
+
+
+def test_no_such_room(ithor):
+    with pytest.raises(SceneError, match="Attic: no such room"):
+        floor_plan.load(ithor, "Attic")

@@ -1,0 +1,179 @@
+"""Traces: the same way, and the same thoughts, as when the episode was played."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from tdanet_jax import env, episode_lookup, episodes, evaluation, trace
+from tdanet_jax.env import TEST_STEP_LIMITS
+from tdanet_jax.reward import Parents
+from tdanet_jax.scenes.dataset import Rooms
+from tdanet_jax.trace import Player
+from tdanet_jax.vocabulary import TARGETS, Action
+from tests import oracle
+from tests.models import equations
+from tests.oracle import Episode, World, pose_of
+
+
+@pytest.fixture(scope="module")
+def player(opinionated_run, ithor):
+    return trace.load_player(opinionated_run, Rooms(ithor, None))
+
+
+@pytest.fixture(scope="module")
+def chosen(ithor, player):
+    return episodes.draw(ithor, player.task.split.eval_scenes, TARGETS, 3, seed=5)
+
+
+def one(chosen, i):
+    return dataclasses.replace(chosen, pose=chosen.pose[i : i + 1], target=chosen.target[i : i + 1])
+
+
+def test_sampled_episodes_come_from_the_probabilities_and_the_stream_of_the_evaluation(
+    ithor, player, chosen
+):
+    """The batch's actions, drawn again from the traces' probabilities with the same keys."""
+    key = jax.random.key(3)
+    records = evaluation.evaluate(
+        player.policy, player.weights, player.task.eval_params, chosen, key
+    )
+    traces = [
+        trace.retrace(player, ithor, one(chosen, i), records.actions[i, : records.length[i]])
+        for i in range(len(chosen))
+    ]
+    np.testing.assert_array_equal([t.success for t in traces], records.success)
+    np.testing.assert_array_equal([t.shortest for t in traces], records.shortest)
+    drawn = 0
+    for step in range(30):
+        alive = [i for i, t in enumerate(traces) if step < len(t.actions)]
+        logits = np.zeros((len(traces), 6))
+        logits[alive] = np.log([traces[i].probabilities[step] for i in alive])
+        again = np.asarray(jax.random.categorical(jax.random.fold_in(key, step), logits))
+        np.testing.assert_array_equal(again[alive], [traces[i].actions[step] for i in alive])
+        drawn += len(alive)
+    assert drawn > 50
+
+
+def test_a_greedy_player_takes_the_most_probable_action_and_walks_as_the_slow_world_says(
+    ithor, player, chosen
+):
+    world = World(ithor, {}, TEST_STEP_LIMITS, oracle.walk_on_grid(ithor))
+    seen = trace.play(dataclasses.replace(player, greedy=True), ithor, one(chosen, 4))
+    np.testing.assert_array_equal(seen.actions, seen.probabilities.argmax(axis=1))
+    assert len(seen.pose) == len(seen.actions) + 1
+    episode = Episode(pose_of(int(seen.pose[0])), seen.target)
+    for action, pose in zip(seen.actions, seen.pose[1:], strict=True):
+        outcome = world.act(episode, int(action))
+        assert episode.pose == pose_of(int(pose))
+    assert outcome.success == seen.success
+
+
+def test_attention_and_difference_are_those_of_the_printed_equations(
+    ithor, player, chosen, opinionated_run, glove
+):
+    seen = trace.play(player, ithor, one(chosen, 0))
+    weights = jax.tree.map(lambda x: np.asarray(x, np.float64), player.weights["encoder"])
+    words = np.asarray(player.task.words, np.float64)
+    target = np.concatenate([equations.TARGET_BOX, words[ithor.classes.index(seen.target)]])
+    compared = 0
+    for step, pose in enumerate(seen.pose[:-1]):
+        view = trace.view(ithor, pose)
+        assert seen.attention[step].shape == seen.correspondence[step].shape == (len(view.boxes),)
+        if not len(view.boxes):
+            continue
+        x1, y1, x2, y2 = view.boxes.T
+        boxes = np.stack([(x1 + x2) / 2, (y1 + y2) / 2, (x2 - x1) * (y2 - y1)], axis=1)
+        rows = np.hstack([boxes, words[[ithor.classes.index(name) for name in view.classes]]])
+        printed = equations.attention(np, weights, rows, target)
+        np.testing.assert_allclose(seen.attention[step], printed, rtol=1e-3, atol=1e-6)
+        query = equations.linear(weights["attention"], target)
+        inner = equations.linear(weights["attention"], rows) @ query
+        np.testing.assert_allclose(seen.correspondence[step], inner, rtol=1e-3, atol=1e-4)
+
+        def branch(row):
+            hidden = np.maximum(equations.linear(weights["linear1"], row), 0)
+            return np.maximum(equations.linear(weights["linear2"], hidden), 0)
+
+        apart = np.abs(branch(printed @ rows) - branch(target)).mean()
+        np.testing.assert_allclose(seen.difference[step], apart, rtol=1e-3, atol=1e-6)
+        compared += 1
+    assert compared >= 3
+
+
+def test_objects_of_a_class_share_the_weight_of_its_merged_row(ithor, player, chosen):
+    task = player.task
+    nothing = Parents(
+        np.full((len(ithor.targets), 3), -1, np.int32),
+        np.zeros((len(ithor.targets), 3), np.float32),
+    )
+    merged = env.make_params(ithor, TARGETS, nothing, TEST_STEP_LIMITS, merge=True)
+    other = dataclasses.replace(player, task=dataclasses.replace(task, eval_params=merged))
+    seen = trace.play(other, ithor, one(chosen, 1))
+    several = 0
+    for pose, weights in zip(seen.pose, seen.attention, strict=False):
+        names = np.array(trace.view(ithor, pose).classes)
+        total = 0.0
+        for name in set(names):
+            own = weights[names == name]
+            several += len(own) > 1
+            assert (own == own[0]).all()
+            total += own[0]
+        assert total == pytest.approx(1, abs=1e-5) or not len(names)
+    assert several
+
+
+def test_the_shortest_path_has_a_way_and_no_thoughts(ithor, player, chosen):
+    best = Player("shortest path", player.task)
+    for i in range(0, len(chosen), 3):
+        seen = trace.play(best, ithor, one(chosen, i))
+        assert seen.success
+        assert len(seen.actions) == seen.shortest
+        assert seen.probabilities is seen.value is seen.attention is seen.difference is None
+    assert player.attends
+    assert not best.attends
+
+
+def test_a_recorded_episode_is_shown_as_it_happened(ithor, player, opinionated_run):
+    ways = set()
+    for i in range(8):
+        record = episode_lookup.read_record(opinionated_run, i, ithor)
+        seen = trace.retrace(player, ithor, record.episode, record.actions)
+        assert seen.success == record.success
+        np.testing.assert_array_equal(seen.actions, record.actions)
+        ways.add(seen.outcome.split(",")[0])
+    assert len(ways) > 1
+
+
+def test_frames_in_which_an_action_was_chosen(ithor, player, chosen):
+    params = player.task.eval_params
+    records = evaluation.evaluate(player.policy, player.weights, params, chosen, jax.random.key(1))
+    pose, target = trace.visited(params, chosen, records)
+    assert len(pose) == len(target) == records.length.sum()
+    first = np.concatenate([[0], np.cumsum(records.length)[:-1]])
+    np.testing.assert_array_equal(pose[first], chosen.pose)
+    np.testing.assert_array_equal(target, np.repeat(chosen.target, records.length))
+
+
+def test_outcomes_in_words(ithor, player, chosen):
+    seen = trace.play(player, ithor, one(chosen, 0))
+    variants = {
+        (True, Action.DONE): "success, 1 action, shortest 2",
+        (False, Action.DONE): "failure (Done without the target), 1 action, shortest 2",
+        (False, Action.LOOK_UP): "failure (step limit), 1 action, shortest 2",
+    }
+    for (success, last), words in variants.items():
+        made = dataclasses.replace(seen, success=success, actions=np.array([last]), shortest=2)
+        assert made.outcome == words
+
+
+def test_a_folder_without_a_checkpoint_is_refused(ithor, tmp_path, opinionated_run):
+    with pytest.raises(ValueError, match="is this the folder of a run"):
+        trace.load_player(tmp_path, Rooms(ithor, None))
+    (tmp_path / "config.json").write_text((opinionated_run / "config.json").read_text())
+    with pytest.raises(ValueError, match="no checkpoint"):
+        trace.load_player(tmp_path, Rooms(ithor, None))
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
