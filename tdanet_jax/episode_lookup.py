@@ -115,6 +115,9 @@ def read_record(run: Path | str, index: int, tables: SceneTables) -> Recorded:
 def _parse(row: dict[str, Any], tables: SceneTables) -> Recorded:
     start = Start(float(row["x"]), float(row["z"]), int(row["rotation"]), int(row["horizon"]))
     episode = find(tables, row["scene"], row["target"], start)
+    for name in row["actions"]:
+        if name not in ACTION_NAMES:
+            raise ValueError(f"{name!r}: no action; there are {', '.join(ACTION_NAMES)}")
     actions = np.array([ACTION_NAMES.index(name) for name in row["actions"]], int)
     place = tables.position[episode.pose[0] // POSES_PER_POSITION][[0, 2]]
     here = bool(np.allclose(place, start[:2], atol=1e-3))

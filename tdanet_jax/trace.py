@@ -198,8 +198,8 @@ def visited(
     return pose, np.repeat(episodes.target, taken.sum(axis=1))
 
 
-#: Steps are padded to multiples of this, so that few shapes are ever compiled.
-STEP_BLOCK = 50
+#: Steps are padded to multiples of this, the longest test episode: one shape is compiled.
+STEP_BLOCK = 200
 
 
 def _think(player: Player, tables: SceneTables, trace: Trace, goal: int) -> Trace:

@@ -20,6 +20,7 @@ from tdanet_jax.config import CONFIG_FILE, NetworkConfig, TrainConfig
 from tdanet_jax.learner import TrainState
 from tdanet_jax.scenes import SceneTables, load_tables
 from tdanet_jax.task import make_task
+from tdanet_jax.vocabulary import Action
 from tdanet_jax.words import WordVectors
 
 # No deadline: tests do not time anything. Derandomised: the same examples on every run.
@@ -66,22 +67,23 @@ TINY = TrainConfig(network=NetworkConfig(width=16, hidden=16, precision="float32
 
 @pytest.fixture(scope="session")
 def opinionated_run(
-    ithor: SceneTables, glove: WordVectors, tmp_path_factory: pytest.TempPathFactory
+    some_rooms: SceneTables, glove: WordVectors, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """The folder of a run that nobody trained: a tiny network with opinions, and eight records."""
     folder = tmp_path_factory.mktemp("runs") / "my-run"
     folder.mkdir()
     (folder / CONFIG_FILE).write_text(json.dumps(configs.to_json(TINY)))
-    task = make_task(TINY, ithor, glove)
+    task = make_task(TINY, some_rooms, glove)
     task.classes.save(folder)
     weights = jax.jit(task.model.initialise)(jax.random.key(0), task.words)
     weights["actor"]["kernel"] *= 60
+    weights["actor"]["bias"] = weights["actor"]["bias"].at[Action.DONE].set(-1.0)
     rest = {field.name: jnp.int32(0) for field in dataclasses.fields(TrainState)}
     state = TrainState(**rest | {"params": weights, "key": jax.random.key(0)})
-    Checkpoints(folder).save(state, {"seconds": 0.0, "data_version": ithor.data_version})
-    chosen = episodes.draw(ithor, task.split.eval_scenes, task.split.seen, 2, seed=0)
+    Checkpoints(folder).save(state, {"seconds": 0.0, "data_version": some_rooms.data_version})
+    chosen = episodes.draw(some_rooms, task.split.eval_scenes, task.split.seen, 2, seed=0)
     policy = policies.network(task.model, task.words)
     records = evaluation.evaluate(policy, weights, task.eval_params, chosen, jax.random.key(0))
-    rows = report.episode_rows("seen", report.columns(ithor, chosen, records), records)
+    rows = report.episode_rows("seen", report.columns(some_rooms, chosen, records), records)
     (folder / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return folder

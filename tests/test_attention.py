@@ -11,8 +11,8 @@ from tdanet_jax.scenes.dataset import Rooms
 
 
 @pytest.fixture(scope="module")
-def player(opinionated_run, ithor):
-    return trace.load_player(opinionated_run, Rooms(ithor, None))
+def player(opinionated_run, some_rooms):
+    return trace.load_player(opinionated_run, Rooms(some_rooms, None))
 
 
 def pairs_of(player, tables, pose, target):
@@ -23,13 +23,13 @@ def pairs_of(player, tables, pose, target):
     )  # fmt: skip
 
 
-def test_means_are_those_of_a_plain_loop(ithor, player):
+def test_means_are_those_of_a_plain_loop(some_rooms, player):
     rng = np.random.default_rng(0)
-    some = rng.choice(ithor.num_states, 300)
+    some = rng.choice(some_rooms.num_states, 300)
     pose = np.concatenate([some, some[:40]])  # repeated frames count twice
-    target = np.resize(rng.integers(len(ithor.targets), size=30), len(pose))
+    target = np.resize(rng.integers(len(some_rooms.targets), size=30), len(pose))
     target[300:] = target[:40]
-    pairs = pairs_of(player, ithor, pose, target)
+    pairs = pairs_of(player, some_rooms, pose, target)
     task = player.task
     _, looks = attention.look(
         player.model, player.weights, task.words, task.eval_params, pose, target
@@ -37,9 +37,9 @@ def test_means_are_those_of_a_plain_loop(ithor, player):
     weights = np.asarray(looks.attention, np.float64)
     found: dict[tuple[int, int], list[tuple[float, float]]] = {}
     for i in range(len(pose)):
-        rows = slice(ithor.row_start[pose[i]], ithor.row_start[pose[i] + 1])
-        classes = ithor.row_class[rows]
-        own = ithor.classes.index(ithor.targets[target[i]])
+        rows = slice(some_rooms.row_start[pose[i]], some_rooms.row_start[pose[i] + 1])
+        classes = some_rooms.row_class[rows]
+        own = some_rooms.classes.index(some_rooms.targets[target[i]])
         for c in set(classes.tolist()):
             if c == own or own not in classes:
                 share = (weights[i, : len(classes)][classes == c].sum(), (classes == c).mean())

@@ -65,11 +65,11 @@ def test_names_in_short():
     assert name_ranges(()) == ""
 
 
-def test_damaged_records_are_refused_by_line(ithor, opinionated_run, tmp_path):
+def test_damaged_records_are_refused_by_line(some_rooms, opinionated_run, tmp_path):
     good = json.loads((opinionated_run / "episodes.jsonl").read_text().splitlines()[0])
     bad = {
         "recorded on other scene tables": good | {"L": good["L"] + 1},
-        "is not in": good | {"actions": ["Jump"]},
+        "'Jump': no action; there are MoveAhead": good | {"actions": ["Jump"]},
         "no actions": good | {"actions": []},
         "no such room": good | {"scene": "FloorPlan999"},
         "'x'": {key: value for key, value in good.items() if key != "x"},
@@ -82,10 +82,10 @@ def test_damaged_records_are_refused_by_line(ithor, opinionated_run, tmp_path):
     messages = [*bad, "recorded on other scene tables", "Expecting property name"]
     for i, message in enumerate(messages):
         with pytest.raises(ValueError, match=message) as refused:
-            read_record(tmp_path, i, ithor)
+            read_record(tmp_path, i, some_rooms)
         assert f"line {i + 1}: " in str(refused.value)
     with pytest.raises(ValueError, match=f"no episode {len(lines)}; there are 0 to "):
-        read_record(tmp_path, len(lines), ithor)
+        read_record(tmp_path, len(lines), some_rooms)
     with pytest.raises(ValueError, match="no such file; a run writes it when training ends"):
-        read_record(tmp_path / "nowhere", 0, ithor)
-    assert episode_lookup.read_record(opinionated_run, 0, ithor).success == good["success"]
+        read_record(tmp_path / "nowhere", 0, some_rooms)
+    assert episode_lookup.read_record(opinionated_run, 0, some_rooms).success == good["success"]

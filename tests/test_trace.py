@@ -20,13 +20,13 @@ from tests.oracle import Episode, World, pose_of
 
 
 @pytest.fixture(scope="module")
-def player(opinionated_run, ithor):
-    return trace.load_player(opinionated_run, Rooms(ithor, None))
+def player(opinionated_run, some_rooms):
+    return trace.load_player(opinionated_run, Rooms(some_rooms, None))
 
 
 @pytest.fixture(scope="module")
-def chosen(ithor, player):
-    return episodes.draw(ithor, player.task.split.eval_scenes, TARGETS, 3, seed=5)
+def chosen(some_rooms, player):
+    return episodes.draw(some_rooms, player.task.split.eval_scenes, TARGETS, 3, seed=5)
 
 
 def one(chosen, i):
@@ -34,7 +34,7 @@ def one(chosen, i):
 
 
 def test_sampled_episodes_come_from_the_probabilities_and_the_stream_of_the_evaluation(
-    ithor, player, chosen
+    some_rooms, player, chosen
 ):
     """The batch's actions, drawn again from the traces' probabilities with the same keys."""
     key = jax.random.key(3)
@@ -42,7 +42,7 @@ def test_sampled_episodes_come_from_the_probabilities_and_the_stream_of_the_eval
         player.policy, player.weights, player.task.eval_params, chosen, key
     )
     traces = [
-        trace.retrace(player, ithor, one(chosen, i), records.actions[i, : records.length[i]])
+        trace.retrace(player, some_rooms, one(chosen, i), records.actions[i, : records.length[i]])
         for i in range(len(chosen))
     ]
     np.testing.assert_array_equal([t.success for t in traces], records.success)
@@ -50,6 +50,8 @@ def test_sampled_episodes_come_from_the_probabilities_and_the_stream_of_the_eval
     drawn = 0
     for step in range(30):
         alive = [i for i, t in enumerate(traces) if step < len(t.actions)]
+        if not alive:
+            break
         logits = np.zeros((len(traces), 6))
         logits[alive] = np.log([traces[i].probabilities[step] for i in alive])
         again = np.asarray(jax.random.categorical(jax.random.fold_in(key, step), logits))
@@ -59,10 +61,10 @@ def test_sampled_episodes_come_from_the_probabilities_and_the_stream_of_the_eval
 
 
 def test_a_greedy_player_takes_the_most_probable_action_and_walks_as_the_slow_world_says(
-    ithor, player, chosen
+    some_rooms, player, chosen
 ):
-    world = World(ithor, {}, TEST_STEP_LIMITS, oracle.walk_on_grid(ithor))
-    seen = trace.play(dataclasses.replace(player, greedy=True), ithor, one(chosen, 4))
+    world = World(some_rooms, {}, TEST_STEP_LIMITS, oracle.walk_on_grid(some_rooms))
+    seen = trace.play(dataclasses.replace(player, greedy=True), some_rooms, one(chosen, 4))
     np.testing.assert_array_equal(seen.actions, seen.probabilities.argmax(axis=1))
     assert len(seen.pose) == len(seen.actions) + 1
     episode = Episode(pose_of(int(seen.pose[0])), seen.target)
@@ -73,21 +75,21 @@ def test_a_greedy_player_takes_the_most_probable_action_and_walks_as_the_slow_wo
 
 
 def test_attention_and_difference_are_those_of_the_printed_equations(
-    ithor, player, chosen, opinionated_run, glove
+    some_rooms, player, chosen, opinionated_run, glove
 ):
-    seen = trace.play(player, ithor, one(chosen, 0))
+    seen = trace.play(player, some_rooms, one(chosen, 0))
     weights = jax.tree.map(lambda x: np.asarray(x, np.float64), player.weights["encoder"])
     words = np.asarray(player.task.words, np.float64)
-    target = np.concatenate([equations.TARGET_BOX, words[ithor.classes.index(seen.target)]])
+    target = np.concatenate([equations.TARGET_BOX, words[some_rooms.classes.index(seen.target)]])
     compared = 0
     for step, pose in enumerate(seen.pose[:-1]):
-        view = trace.view(ithor, pose)
+        view = trace.view(some_rooms, pose)
         assert seen.attention[step].shape == seen.correspondence[step].shape == (len(view.boxes),)
         if not len(view.boxes):
             continue
         x1, y1, x2, y2 = view.boxes.T
         boxes = np.stack([(x1 + x2) / 2, (y1 + y2) / 2, (x2 - x1) * (y2 - y1)], axis=1)
-        rows = np.hstack([boxes, words[[ithor.classes.index(name) for name in view.classes]]])
+        rows = np.hstack([boxes, words[[some_rooms.classes.index(name) for name in view.classes]]])
         printed = equations.attention(np, weights, rows, target)
         np.testing.assert_allclose(seen.attention[step], printed, rtol=1e-3, atol=1e-6)
         query = equations.linear(weights["attention"], target)
@@ -104,18 +106,18 @@ def test_attention_and_difference_are_those_of_the_printed_equations(
     assert compared >= 3
 
 
-def test_objects_of_a_class_share_the_weight_of_its_merged_row(ithor, player, chosen):
+def test_objects_of_a_class_share_the_weight_of_its_merged_row(some_rooms, player, chosen):
     task = player.task
     nothing = Parents(
-        np.full((len(ithor.targets), 3), -1, np.int32),
-        np.zeros((len(ithor.targets), 3), np.float32),
+        np.full((len(some_rooms.targets), 3), -1, np.int32),
+        np.zeros((len(some_rooms.targets), 3), np.float32),
     )
-    merged = env.make_params(ithor, TARGETS, nothing, TEST_STEP_LIMITS, merge=True)
+    merged = env.make_params(some_rooms, TARGETS, nothing, TEST_STEP_LIMITS, merge=True)
     other = dataclasses.replace(player, task=dataclasses.replace(task, eval_params=merged))
-    seen = trace.play(other, ithor, one(chosen, 1))
+    seen = trace.play(other, some_rooms, one(chosen, 1))
     several = 0
     for pose, weights in zip(seen.pose, seen.attention, strict=False):
-        names = np.array(trace.view(ithor, pose).classes)
+        names = np.array(trace.view(some_rooms, pose).classes)
         total = 0.0
         for name in set(names):
             own = weights[names == name]
@@ -126,10 +128,10 @@ def test_objects_of_a_class_share_the_weight_of_its_merged_row(ithor, player, ch
     assert several
 
 
-def test_the_shortest_path_has_a_way_and_no_thoughts(ithor, player, chosen):
+def test_the_shortest_path_has_a_way_and_no_thoughts(some_rooms, player, chosen):
     best = Player("shortest path", player.task)
     for i in range(0, len(chosen), 3):
-        seen = trace.play(best, ithor, one(chosen, i))
+        seen = trace.play(best, some_rooms, one(chosen, i))
         assert seen.success
         assert len(seen.actions) == seen.shortest
         assert seen.probabilities is seen.value is seen.attention is seen.difference is None
@@ -137,18 +139,18 @@ def test_the_shortest_path_has_a_way_and_no_thoughts(ithor, player, chosen):
     assert not best.attends
 
 
-def test_a_recorded_episode_is_shown_as_it_happened(ithor, player, opinionated_run):
+def test_a_recorded_episode_is_shown_as_it_happened(some_rooms, player, opinionated_run):
     ways = set()
     for i in range(8):
-        record = episode_lookup.read_record(opinionated_run, i, ithor)
-        seen = trace.retrace(player, ithor, record.episode, record.actions)
+        record = episode_lookup.read_record(opinionated_run, i, some_rooms)
+        seen = trace.retrace(player, some_rooms, record.episode, record.actions)
         assert seen.success == record.success
         np.testing.assert_array_equal(seen.actions, record.actions)
         ways.add(seen.outcome.split(",")[0])
     assert len(ways) > 1
 
 
-def test_frames_in_which_an_action_was_chosen(ithor, player, chosen):
+def test_frames_in_which_an_action_was_chosen(some_rooms, player, chosen):
     params = player.task.eval_params
     records = evaluation.evaluate(player.policy, player.weights, params, chosen, jax.random.key(1))
     pose, target = trace.visited(params, chosen, records)
@@ -158,8 +160,8 @@ def test_frames_in_which_an_action_was_chosen(ithor, player, chosen):
     np.testing.assert_array_equal(target, np.repeat(chosen.target, records.length))
 
 
-def test_outcomes_in_words(ithor, player, chosen):
-    seen = trace.play(player, ithor, one(chosen, 0))
+def test_outcomes_in_words(some_rooms, player, chosen):
+    seen = trace.play(player, some_rooms, one(chosen, 0))
     variants = {
         (True, Action.DONE): "success, 1 action, shortest 2",
         (False, Action.DONE): "failure (Done without the target), 1 action, shortest 2",
@@ -170,10 +172,10 @@ def test_outcomes_in_words(ithor, player, chosen):
         assert made.outcome == words
 
 
-def test_a_folder_without_a_checkpoint_is_refused(ithor, tmp_path, opinionated_run):
+def test_a_folder_without_a_checkpoint_is_refused(some_rooms, tmp_path, opinionated_run):
     with pytest.raises(ValueError, match="is this the folder of a run"):
-        trace.load_player(tmp_path, Rooms(ithor, None))
+        trace.load_player(tmp_path, Rooms(some_rooms, None))
     (tmp_path / "config.json").write_text((opinionated_run / "config.json").read_text())
     with pytest.raises(ValueError, match="no checkpoint"):
-        trace.load_player(tmp_path, Rooms(ithor, None))
+        trace.load_player(tmp_path, Rooms(some_rooms, None))
     assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
