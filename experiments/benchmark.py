@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rich.table import Table
 
-from experiments.console import console, fail, one_line_errors, parse
+from experiments.console import check_positive, console, fail, one_line_errors, parse
+from tdanet_jax import files
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 
 if TYPE_CHECKING:
@@ -74,15 +75,19 @@ def main(arguments: list[str] | None = None) -> None:
     with one_line_errors():
         if command.out is not None and command.out.exists():
             fail(f"--out {command.out}: exists")
-        if command.repeats < 1:
-            fail(f"--repeats {command.repeats}: must be positive")
+        check_positive(
+            repeats=command.repeats,
+            devices=command.devices,
+            environments=command.environments,
+            batches=command.batches,
+        )
         rows = []
         for row in measure(command):
             rows.append(row)
             console.print(json.dumps(row))
         console.print(as_table(rows))
         if command.out is not None:
-            command.out.write_text("".join(json.dumps(row) + "\n" for row in rows))
+            files.write_text(command.out, "".join(json.dumps(row) + "\n" for row in rows))
 
 
 def measure(command: Command) -> Iterator[Row]:

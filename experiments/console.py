@@ -7,7 +7,9 @@ import io
 import itertools
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import tyro
@@ -22,6 +24,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.text import Text
+
+from tdanet_jax.files import LOCK_FILE, PARTIAL
 
 Arguments = TypeVar("Arguments")
 
@@ -44,8 +48,14 @@ def one_line_usage() -> Iterator[None]:
     except SystemExit as stop:
         if not stop.code:
             raise
-        lines = [line.strip("│ ") for line in said.getvalue().splitlines()[1:]]
-        fail(" ".join(itertools.takewhile(lambda line: not line.startswith("─"), lines)))
+        lines = [line.strip("│ ") for line in said.getvalue().splitlines()[1:]]  # [0]: a title
+        words = itertools.dropwhile(_is_rule, lines)
+        fail(" ".join(itertools.takewhile(lambda line: not _is_rule(line), words)))
+
+
+def _is_rule(line: str) -> bool:
+    """Whether a line of tyro's box is one of its horizontal lines."""
+    return line.startswith(("─", "---"))
 
 
 def parse(command: type[Arguments], arguments: Sequence[str] | None, **options: Any) -> Arguments:
@@ -56,32 +66,89 @@ def parse(command: type[Arguments], arguments: Sequence[str] | None, **options: 
 
 @contextlib.contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Turns errors that a user can cause (ValueError, OSError) into one line."""
-    try:
-        yield
-    except (ValueError, OSError) as error:
-        fail(error)
+    """Turns warnings, and errors that a user can cause (ValueError, OSError), into one line."""
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning  # type: ignore[assignment]
+        try:
+            yield
+        except OSError as error:
+            fail(f"{error.filename}: {error.strerror}" if error.filename else error)
+        except ValueError as error:
+            fail(error)
+        except KeyboardInterrupt:
+            print("stopped", file=sys.stderr)
+            raise SystemExit(128 + signal.SIGINT) from None
+
+
+def _show_warning(message: Warning | str, *_: Any) -> None:
+    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+def check_empty(folder: Path, instead: str = "") -> None:
+    """Fails unless `folder` is new or holds nothing but what a killed process left half-written."""
+    if not folder.exists():
+        return
+    leftover = (LOCK_FILE, PARTIAL)
+    if not folder.is_dir() or any(not p.name.startswith(leftover) for p in folder.iterdir()):
+        fail(f"--out {folder}: exists and is not empty{instead}")
+
+
+def check_positive(**flags: int | Sequence[int]) -> None:
+    """Fails if a flag's value, or one of its values, is below 1."""
+    for name, given in flags.items():
+        for value in (given,) if isinstance(given, int) else given:
+            if value < 1:
+                fail(f"--{name} {value}: must be positive")
+
+
+class Stopped(KeyboardInterrupt):
+    """SIGTERM or Ctrl-C came; `signal` is its number."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.signal = number
 
 
 class StopRequest:
-    """Remembers the first SIGTERM or Ctrl-C inside its `with` block; a second one interrupts."""
+    """Turns SIGTERM and Ctrl-C into `Stopped`, at once or, inside `deferred`, at its end."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
+        self._deferring = False
 
-    def __enter__(self) -> StopRequest:
-        signals = (signal.SIGTERM, signal.SIGINT)
-        self._before = {number: signal.signal(number, self._remember) for number in signals}
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _remember(self, number: int, frame: Any) -> None:
+    @contextlib.contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Inside, the first signal is remembered in `signal`; a second one does not wait."""
+        self._deferring = True
+        try:
+            yield
+        finally:
+            self._deferring = False
         if self.signal is not None:
-            raise KeyboardInterrupt
-        self.signal = number
+            raise Stopped(self.signal)
+
+    def receive(self, number: int, frame: Any) -> None:
+        """The signals' handler."""
+        if self._deferring and self.signal is None:
+            self.signal = number
+        else:
+            raise Stopped(number)
+
+
+@contextlib.contextmanager
+def stoppable(advice: Callable[[], str]) -> Iterator[StopRequest]:
+    """Inside, SIGTERM or Ctrl-C ends the program: one line of advice, status 128 + signal."""
+    stop = StopRequest()
+    signals = (signal.SIGTERM, signal.SIGINT)
+    before = {number: signal.signal(number, stop.receive) for number in signals}
+    try:
+        yield stop
+    except Stopped as stopped:
+        console.print(f"stopped; {advice()}")
+        raise SystemExit(128 + stopped.signal) from None
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class _Figures(ProgressColumn):

@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from experiments.console import console, fail, one_line_errors, parse, print_summary, reporter
+from experiments.console import (
+    check_empty,
+    console,
+    fail,
+    one_line_errors,
+    parse,
+    print_summary,
+    reporter,
+)
 from tdanet_jax.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -64,10 +72,9 @@ def main(arguments: list[str] | None = None) -> None:
             fail(f"--policy {command.policy} has no --history")
         if len(set(command.checkpoint)) < len(command.checkpoint):
             fail("--checkpoint: a run is given twice")
-        TrainConfig(split=command.split).check()
+        TrainConfig(split=command.split, seed=command.seed).check()
         folder = command.out or default_folder(command)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            fail(f"--out {folder}: exists and is not empty")
+        check_empty(folder)
         if not trained:
             evaluate_untrained(command, folder)
             return

@@ -16,7 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from experiments.benchmark import Row, update_cost
-from experiments.console import console, fail, one_line_errors, parse, reporter
+from experiments.console import (
+    check_empty,
+    check_positive,
+    console,
+    one_line_errors,
+    parse,
+    reporter,
+)
 from tdanet_jax.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -50,12 +57,14 @@ def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     command = parse(Command, arguments, prog="scaling")
     with one_line_errors():
-        if command.out.exists() and (not command.out.is_dir() or any(command.out.iterdir())):
-            fail(f"--out {command.out}: exists and is not empty")
-        for flag in ("environments", "rooms", "classes", "detections", "repeats"):
-            value = getattr(command, flag)
-            if min(value if isinstance(value, tuple) else (value,), default=1) < 1:
-                fail(f"--{flag}: must be positive")
+        check_empty(command.out)
+        check_positive(
+            environments=command.environments,
+            rooms=command.rooms,
+            classes=command.classes,
+            detections=command.detections,
+            repeats=command.repeats,
+        )
         scale(command)
 
 
@@ -87,6 +96,10 @@ def measure(command: Command, task: Task) -> Iterator[Row]:
 
     count = LearnerConfig().num_envs
     model, words, params = task.model, task.train_words, task.train_params
+    for size, least in (("classes", len(words)), ("detections", params.max_detections)):
+        for value in getattr(command, size):
+            if value < least:
+                raise ValueError(f"--{size} {value}: the rooms need at least {least}")
 
     def row(size: str, value: int, words: jax.Array, params: EnvParams, count: int) -> Row:
         return {"size": size, "value": value} | update_cost(
@@ -98,8 +111,6 @@ def measure(command: Command, task: Task) -> Iterator[Row]:
     for value in command.rooms:
         yield row("rooms", value, words, with_rooms(task, value), count)
     for value in command.classes:
-        if value < len(words):
-            raise ValueError(f"--classes {value}: the rooms have {len(words)}")
         padded = jnp.pad(words, ((0, value - len(words)), (0, 0)))
         yield row("classes", value, padded, params, count)
     for value in command.detections:
@@ -167,8 +178,6 @@ def with_detections(params: EnvParams, rows: int) -> EnvParams:
     import jax.numpy as jnp
 
     more = rows - params.max_detections
-    if more < 0:
-        raise ValueError(f"--detections {rows}: a frame holds up to {params.max_detections}")
     return params.replace(
         max_detections=rows,
         row_class=jnp.pad(params.row_class, (0, more)),

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -19,13 +20,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from experiments.console import console, fail, one_line_errors, one_line_usage, reporter
+from experiments.console import (
+    check_positive,
+    console,
+    fail,
+    one_line_errors,
+    one_line_usage,
+    reporter,
+)
 from tdanet_jax.scenes.scene import GRID
 from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TRAIN_SCENES_PER_TYPE
 
 if TYPE_CHECKING:
     from tdanet_jax.scenes import SceneTables, dataset
     from tdanet_jax.scenes.scene import Scene
+
+
+PICTURES = (".png", ".svg", ".pdf")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +69,7 @@ class Verify:
 
     def run(self) -> None:
         """Prints the tables."""
+        check_positive(rooms=self.rooms, views=self.views, worst=self.worst)
         from tdanet_jax.scenes import ithor
 
         start = time.monotonic()
@@ -183,6 +195,12 @@ class Inspect:
         """Writes the picture and lists the view."""
         from tdanet_jax.scenes import picture
 
+        if self.out.suffix not in PICTURES:
+            fail(f"--out {self.out}: must end in {', '.join(PICTURES)}")
+        if self.position is None and (self.rotation or self.horizon):
+            fail("--rotation and --horizon need --position")
+        if self.position is not None and not all(map(math.isfinite, self.position)):
+            fail(f"--position {self.position[0]} {self.position[1]}: must be finite")
         room, tables = self._room()
         if self.position is None:
             state = picture.most_telling_state(tables)
@@ -345,10 +363,14 @@ class Collect:
         """Starts AI2-THOR, visits the rooms, writes the file."""
         from tdanet_jax.scenes import collect
 
-        rooms = [(word.rpartition("=")[0], word.rpartition("=")[2]) for word in self.scenes]
-        for name, kind in rooms:
+        if not self.scenes:
+            fail("collect: name a room, say FloorPlan1=kitchen")
+        rooms = []
+        for word in self.scenes:
+            name, _, kind = word.rpartition("=")
             if not name or kind not in ROOM_TYPES:
-                fail(f"{name}={kind}: not NAME=TYPE with a type of {', '.join(ROOM_TYPES)}")
+                fail(f"{word}: not NAME=TYPE with a type of {', '.join(ROOM_TYPES)}")
+            rooms.append((name, kind))
         controller = _start_ai2thor()
         try:
             collect.write_scenes(collect.collect(controller, rooms), self.out)

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
+import importlib.util
 import sys
 import time
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -22,18 +23,21 @@ import tyro
 
 from experiments.console import (
     StopRequest,
+    check_empty,
     console,
     fail,
     one_line_errors,
     parse,
     print_summary,
     reporter,
+    stoppable,
 )
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, PRESETS, TrainConfig
 
 if TYPE_CHECKING:
-    from tdanet_jax.training import Row
+    from tdanet_jax.episodes import Episodes
+    from tdanet_jax.training import Row, Run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,9 +79,15 @@ def main(arguments: list[str] | None = None) -> None:
             config.check()
             config = config.with_absolute_paths()
             folder = command.out or default_folder(config)
-            if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-                fail(f"--out {folder}: exists and is not empty (to go on there: --resume {folder})")
-        train(config, folder, command.tensorboard)
+            check_new(folder)
+        if command.tensorboard and importlib.util.find_spec("tensorboardX") is None:
+            fail("--tensorboard needs tensorboardX: pip install 'tdanet-jax[tensorboard]'")
+        train(config, folder, command.tensorboard, resume=command.resume is not None)
+
+
+def check_new(folder: Path) -> None:
+    """Fails if a run cannot begin in `folder`."""
+    check_empty(folder, f" (to go on there: --resume {folder})")
 
 
 def default_folder(config: TrainConfig) -> Path:
@@ -87,87 +97,136 @@ def default_folder(config: TrainConfig) -> Path:
     return Path("runs") / f"{split}-{config.model}-seed{config.seed}-{stamp}"
 
 
-def train(config: TrainConfig, folder: Path, tensorboard: bool) -> None:
+def train(config: TrainConfig, folder: Path, tensorboard: bool, resume: bool = False) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
-    from tdanet_jax import episodes, evaluation, figures, policies, report
+    from tdanet_jax import episodes, files
+    from tdanet_jax.checkpoint import FOLDER
     from tdanet_jax.task import load_task, resolve_precision
-    from tdanet_jax.training import Run, read_metrics
+    from tdanet_jax.training import Run
 
-    with reporter("rooms", every=30, transient=True) as report_rooms:
-        task = load_task(config, lambda done, total: report_rooms(done / total, "rebuilt"))
-    lists = episodes.load(task.tables, task.split, task.extras)
-    # What `auto` means here is part of the run: it goes on with the same products elsewhere.
-    config = dataclasses.replace(config, network=resolve_precision(config.network))
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / CONFIG_FILE).write_text(json.dumps(configs.to_json(config), indent=2) + "\n")
-    task.classes.save(folder)
-    run = Run(folder, config, task)
-    console.print(f"{config.model}, split {task.split.name}, seed {config.seed} -> {folder}")
-    console.print("compiling ...")
+    with stoppable(lambda: how_to_go_on(folder)) as stop:
+        with reporter("rooms", every=30, transient=True) as report_rooms:
+            task = load_task(config, lambda done, total: report_rooms(done / total, "rebuilt"))
+        lists = episodes.load(task.tables, task.split, task.extras)
+        # What `auto` means here is part of the run: it goes on with the same products elsewhere.
+        config = dataclasses.replace(config, network=resolve_precision(config.network))
+        with files.locked(folder):
+            if not resume:
+                check_new(folder)  # again: another process may have begun there meanwhile
+            for path in files.remove_partial(folder) + files.remove_partial(folder / FOLDER):
+                console.print(f"removed {path}: half-written when the run was stopped")
+            configs.save(config, folder / CONFIG_FILE)
+            task.classes.save(folder)
+            run = Run(folder, config, task)
+            console.print(f"{title(run)} -> {folder}")
+            learn(run, tensorboard, stop)
+            report_on(run, lists)
+
+
+def how_to_go_on(folder: Path) -> str:
+    """What to say to someone who has stopped a run."""
+    from tdanet_jax.checkpoint import Checkpoints
+
+    if not (folder / CONFIG_FILE).exists():
+        return "the run had not begun"
+    again = f"go on with: python -m experiments.train_zero_shot --resume {folder}"
+    return f"{Checkpoints(folder).latest() or 0:,} updates are saved; {again}"
+
+
+def title(run: Run) -> str:
+    """tdanet, split 18/4, seed 0."""
+    return f"{run.config.model}, split {run.task.split.name}, seed {run.config.seed}"
+
+
+def learn(run: Run, tensorboard: bool, stop: StopRequest) -> None:
+    """Trains to the end of the budget or to a signal, and saves."""
+    run.save()  # who cannot save learns it before training, not after
     saved = run.seconds
+    console.print("compiling ...")
     with (
-        StopRequest() as stop,
+        stop.deferred(),
         reporter("training", every=10) as show,
-        metrics_sink(folder, tensorboard) as sink,
+        metrics_sink(run.folder, tensorboard) as sink,
     ):
         for row in run.chunks():
-            show(
-                run.progress,
-                f"{row['steps_per_second']:,.0f} steps/s  {row['episodes']:,} episodes  "
-                f"SR {100 * row['success']:.1f}  SPL {100 * row['spl']:.1f}  "
-                f"entropy {row['entropy']:.2f}",
-            )
+            show(run.progress, figures_of(row))
             sink(row)
-            if run.seconds - saved > 60 * config.checkpoint_minutes:
+            if stop.signal is not None:
+                break
+            if run.seconds - saved > 60 * run.config.checkpoint_minutes:
                 run.save()
                 saved = run.seconds
-            if stop.signal is not None:
-                run.save()
-                console.print(
-                    f"stopped and saved; go on with: "
-                    f"python -m experiments.train_zero_shot --resume {folder}"
-                )
-                raise SystemExit(128 + stop.signal)
-    run.save()
-    title = f"{config.model}, split {task.split.name}, seed {config.seed}"
-    figures.learning_curve(read_metrics(folder), title, folder / "learning_curve.png")
-    console.print("evaluating ...")
-    policy = policies.network(run.model, task.words)
-    played = evaluation.evaluate_lists(
-        policy, run.state.params, task.eval_params, lists, config.seed
+        run.save()
+
+
+def figures_of(row: Row) -> str:
+    """The figures beside the progress bar."""
+    skipped = f"  {row['skipped']} updates skipped" if row["skipped"] else ""
+    return (
+        f"{row['steps_per_second']:,.0f} steps/s  {row['episodes']:,} episodes  "
+        f"SR {100 * row['success']:.1f}  SPL {100 * row['spl']:.1f}  "
+        f"entropy {row['entropy']:.2f}{skipped}"
     )
-    provenance = report.Provenance(
-        split=task.split.name,
-        model=config.model,
-        policy="sample",
-        episodes_trained=int(run.state.episodes),
-        seed=config.seed,
-        steps=run.steps,
-        data_version=task.tables.data_version,
-        data=config.data,
-    )
-    print_summary(report.write(folder, provenance, task.tables, played))
-    console.print(f"wrote {folder / 'results.md'}")
 
 
 @contextlib.contextmanager
 def metrics_sink(folder: Path, tensorboard: bool) -> Iterator[Callable[[Row], None]]:
-    """Where rows of metrics go beside `metrics.jsonl`: TensorBoard, or nowhere."""
+    """Where rows of metrics go beside `metrics.jsonl`: TensorBoard, or nowhere.
+
+    Events that cannot be written are given up with a warning; training goes on.
+    """
     if not tensorboard:
         yield lambda row: None
         return
-    try:
-        from tensorboardX import SummaryWriter
-    except ImportError:
-        fail("--tensorboard needs tensorboardX: pip install 'tdanet-jax[tensorboard]'")
-    with SummaryWriter(str(folder / "tensorboard")) as writer:
+    # Not SummaryWriter: its thread dies of a full disk, and its queue then blocks for ever.
+    from tensorboardX.event_file_writer import EventsWriter
+    from tensorboardX.proto.event_pb2 import Event
+    from tensorboardX.summary import scalar
 
-        def write(row: Row) -> None:
-            for name, value in row.items():
-                if name != "steps":
-                    writer.add_scalar(f"train/{name}", value, row["steps"])
+    writer: EventsWriter | None = None
+    lost = False
 
-        yield write
+    def write(row: Row) -> None:
+        nonlocal writer, lost
+        if lost:
+            return
+        try:
+            if writer is None:
+                (folder / "tensorboard").mkdir(exist_ok=True)
+                writer = EventsWriter(str(folder / "tensorboard" / "events"))
+            for name in row:
+                summary = scalar(f"train/{name}", row[name])
+                writer.write_event(Event(wall_time=time.time(), step=row["steps"], summary=summary))
+            writer.flush()
+        except OSError as error:
+            lost = True
+            warnings.warn(f"{folder / 'tensorboard'}: given up ({error.strerror})", stacklevel=2)
+
+    yield write
+
+
+def report_on(run: Run, lists: Mapping[str, Episodes]) -> None:
+    """Evaluates the agent and writes the results and the learning curve."""
+    from tdanet_jax import evaluation, figures, policies, report
+    from tdanet_jax.training import read_metrics
+
+    figures.learning_curve(read_metrics(run.folder), title(run), run.folder / "learning_curve.png")
+    console.print("evaluating ...")
+    task, seed = run.task, run.config.seed
+    policy = policies.network(run.model, task.words)
+    played = evaluation.evaluate_lists(policy, run.state.params, task.eval_params, lists, seed)
+    provenance = report.Provenance(
+        split=task.split.name,
+        model=run.config.model,
+        policy="sample",
+        episodes_trained=int(run.state.episodes),
+        seed=seed,
+        steps=run.steps,
+        data_version=task.tables.data_version,
+        data=run.config.data,
+    )
+    print_summary(report.write(run.folder, provenance, task.tables, played))
+    console.print(f"wrote {run.folder / 'results.md'}")
 
 
 if __name__ == "__main__":

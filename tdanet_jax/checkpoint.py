@@ -29,6 +29,10 @@ KEPT = 2
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax narrates every file it touches
 
 
+class NewerFormat(ValueError):
+    """A checkpoint that only a newer version can read."""
+
+
 class Checkpoints:
     """The checkpoints of one run's folder."""
 
@@ -115,6 +119,8 @@ class Checkpoints:
         for step in self._steps():
             try:
                 found = self._read_one(self.folder / str(step), shapes)
+            except NewerFormat:
+                raise  # it is sound: no older one shall be taken in its place
             except (ValueError, OSError) as error:
                 faults.append(error)
                 continue
@@ -135,7 +141,7 @@ class Checkpoints:
         except Exception as error:  # Orbax raises many kinds for a damaged folder
             raise ValueError(f"{path}: unreadable checkpoint ({_reason(error)})") from error
         if written > FORMAT:
-            raise ValueError(
+            raise NewerFormat(
                 f"{path}: checkpoint of format {written}, this version reads up to {FORMAT}: "
                 "a newer tdanet_jax wrote it"
             )

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tdanet_jax import files
+
 CLASSES_FILE = "classes.json"
 
 
@@ -30,7 +32,7 @@ class Classes:
 
     def save(self, run: Path) -> None:
         """Writes `classes.json` into a run's folder."""
-        (run / CLASSES_FILE).write_text(json.dumps(dataclasses.asdict(self)) + "\n")
+        files.write_text(run / CLASSES_FILE, json.dumps(dataclasses.asdict(self)) + "\n")
 
 
 def make_classes(

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+from tdanet_jax import files
 from tdanet_jax.vocabulary import UNSEEN
 
 #: Models by name: the module that makes each, and the settings that it is made with.
@@ -119,6 +121,12 @@ class TrainConfig:
 
     def check(self) -> None:
         """Raises ValueError, with one line that names the flag, if a value is out of range."""
+        for part in (self, self.learner, self.network):
+            for name, kind in get_type_hints(type(part)).items():
+                if not _fits(value := getattr(part, name), kind):
+                    wanted = "finite" if isinstance(value, float) else f"of type {kind}"
+                    raise ValueError(f"--{name.replace('_', '-')} {value}: must be {wanted}")
+        check_seed(self.seed)
         if self.split not in UNSEEN:
             raise ValueError(f"--split {self.split}: choose one of {', '.join(UNSEEN)}")
         if self.model not in MODELS and "." not in self.model:
@@ -135,6 +143,8 @@ class TrainConfig:
             "--rollout-steps": self.learner.rollout_steps,
             "--step-limit": self.learner.step_limit,
             "--learning-rate": self.learner.learning_rate,
+            "--adam-epsilon": self.learner.adam_epsilon,
+            "--max-grad-norm": self.learner.max_grad_norm,
             "--width": self.network.width,
             "--hidden": self.network.hidden,
             "--word-norm": self.network.word_norm,
@@ -142,8 +152,16 @@ class TrainConfig:
         for flag, value in positive.items():
             if value is not None and not value > 0:
                 raise ValueError(f"{flag} {value}: must be positive")
-        if self.history < 0:
-            raise ValueError(f"--history {self.history}: must not be negative")
+        not_negative = {
+            "--history": self.history,
+            "--final-learning-rate": self.learner.final_learning_rate,
+            "--entropy-weight": self.learner.entropy_weight,
+            "--final-entropy-weight": self.learner.final_entropy_weight,
+            "--value-weight": self.learner.value_weight,
+        }
+        for flag, value in not_negative.items():
+            if value < 0:
+                raise ValueError(f"{flag} {value}: must not be negative")
         shares = {
             "--gamma": self.learner.gamma,
             "--gae-lambda": self.learner.gae_lambda,
@@ -167,6 +185,23 @@ class TrainConfig:
     def steps_per_update(self) -> int:
         """Environment steps in one update."""
         return self.learner.num_envs * self.learner.rollout_steps
+
+
+def check_seed(seed: int) -> None:
+    """Raises ValueError if a seed is not one of the 2^32 that give different keys."""
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"--seed {seed}: must be between 0 and {2**32 - 1}")
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a value is of a field's type; numbers must be finite."""
+    if get_origin(kind) is Literal:
+        return value in get_args(kind)
+    if get_args(kind):
+        return any(_fits(value, one) for one in get_args(kind))
+    if kind is float:
+        return isinstance(value, int | float) and math.isfinite(value)
+    return isinstance(value, kind) and isinstance(value, bool) == (kind is bool)
 
 
 #: The reference's constants, on our environment and update.
@@ -213,6 +248,11 @@ def from_json(values: Mapping[str, Any]) -> TrainConfig:
         raise ValueError(f"not a configuration of this version: {error}") from None
     config.check()
     return config
+
+
+def save(config: TrainConfig, path: Path) -> None:
+    """Writes a run's `config.json`."""
+    files.write_text(path, json.dumps(to_json(config), indent=2) + "\n")
 
 
 def load(path: Path) -> TrainConfig:

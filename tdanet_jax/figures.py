@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from tdanet_jax import files
 from tdanet_jax.comparison import GROUPS, MEASURES, Curve
 
 #: Colours (Okabe and Ito) that stay apart for the colour-blind and, with the dashes, in grey.
@@ -42,7 +43,8 @@ def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> No
     for axis in (left, right):
         _episodes_along(axis)
     figure.suptitle(title)
-    figure.savefig(path, dpi=130)
+    with files.replacing(path) as fresh:
+        figure.savefig(fresh, dpi=130)
 
 
 def scaling(rows: Sequence[dict[str, Any]], path: Path) -> None:
@@ -69,7 +71,8 @@ def scaling(rows: Sequence[dict[str, Any]], path: Path) -> None:
     axes[0, 0].yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:,.0f}"))
     axes[1, 0].set_ylabel("memory (MB)")
     axes[1, 0].legend(frameon=False)
-    figure.savefig(path, dpi=130)
+    with files.replacing(path) as fresh:
+        figure.savefig(fresh, dpi=130)
 
 
 _MEMORY = {"temporary_mb": "rollout and tape", "arguments_mb": "rooms, parameters, state"}
@@ -93,7 +96,8 @@ def evaluated_curves(curves: Sequence[Curve], title: str, path: Path) -> None:
     figure.suptitle(title)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-    figure.savefig(path, dpi=130)
+    with files.replacing(path) as fresh:
+        figure.savefig(fresh, dpi=130)
 
 
 def _draw_curve(

@@ -1,13 +1,18 @@
-"""Files that appear whole or not at all, so that a reader never meets a half-written one."""
+"""Files that appear whole or not at all, and locks between processes."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
+#: A process holds the lock of this file while it works in the folder.
+LOCK_FILE = ".lock"
 #: What is being written carries this before its name; a process that is killed may leave it.
 PARTIAL = ".partial-"
 
@@ -36,7 +41,7 @@ def write_text(path: Path, text: str) -> None:
       OSError: it cannot be written; the error names `path`.
     """
     with replacing(path) as fresh:
-        fresh.write_text(text)
+        fresh.write_text(text, encoding="utf-8")
 
 
 def remove_partial(folder: Path) -> list[Path]:
@@ -48,3 +53,25 @@ def remove_partial(folder: Path) -> list[Path]:
         else:
             path.unlink()
     return found
+
+
+@contextlib.contextmanager
+def locked(folder: Path, wait: bool = False) -> Iterator[None]:
+    """Inside, no other process is in here for the same folder, which is made if need be.
+
+    The system gives the lock back when its holder dies, in whatever way.
+
+    Raises:
+      BlockingIOError: another process holds the lock, and `wait` is False.
+      OSError: the folder cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK_FILE)
+    try:
+        lock.acquire(blocking=wait)
+    except Timeout:
+        raise BlockingIOError(errno.EWOULDBLOCK, "in use by another process", str(folder)) from None
+    try:
+        yield
+    finally:
+        lock.release()

@@ -135,7 +135,7 @@ def make_model(config: TrainConfig, classes: Classes) -> ActorCritic:
     module_name, options = MODELS.get(config.model, (config.model, {}))
     try:
         module = importlib.import_module(module_name)
-    except ImportError as error:
+    except (ImportError, TypeError) as error:  # TypeError: a name that begins with a dot
         raise ValueError(f"--model {config.model}: {error}") from None
     if not hasattr(module, "make"):
         raise ValueError(f"--model {config.model}: the module has no function `make`")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tdanet_jax import history, learner
+from tdanet_jax import files, history, learner
 from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.learner import TrainState
@@ -103,7 +105,7 @@ class Run:
         Raises:
           ValueError: too many updates were skipped; the state is saved first.
         """
-        self._drop_rows_after(int(self.state.updates))
+        journal = Journal(self.folder / METRICS_FILE, int(self.state.updates))
         history.drop_after(self.folder, int(self.state.updates))
         chunk = self._compile()
         while self.progress < 1.0:
@@ -121,8 +123,7 @@ class Run:
             took = time.perf_counter() - began
             self.seconds += took
             row = self._row(metrics, took)
-            with (self.folder / METRICS_FILE).open("a") as file:
-                file.write(json.dumps(row) + "\n")
+            journal.write(row)
             self._keep_point(before)
             yield row
             if row["skipped"] >= self.config.max_skipped:
@@ -133,10 +134,16 @@ class Run:
                 )
 
     def _keep_point(self, before: float) -> None:
-        """Adds to the history if the budget's share has passed a point since `before`."""
+        """Adds to the history if the budget's share has passed a point since `before`.
+
+        The run does not depend on it: a point that cannot be written is left out with a warning.
+        """
         point = history.due(before, self.progress, self.config.history)
         if point:
-            history.write(self.folder, self.snapshot(point))
+            try:
+                history.write(self.folder, self.snapshot(point))
+            except OSError as error:
+                warnings.warn(f"{error.filename}: left out ({error.strerror})", stacklevel=3)
 
     def snapshot(self, point: int = 0) -> history.Snapshot:
         """The network as it is now."""
@@ -176,23 +183,45 @@ class Run:
             "steps_per_second": round(steps / took, 1),
         }
 
-    def _drop_rows_after(self, updates: int) -> None:
-        """Rows behind the checkpoint belong to updates that will be done again."""
-        path = self.folder / METRICS_FILE
-        if path.exists():
-            kept = [row for row in read_metrics(self.folder) if row["updates"] <= updates]
-            path.write_text("".join(json.dumps(row) + "\n" for row in kept))
-
 
 _UPDATE_MEANS = ("policy_loss", "value_loss", "entropy", "grad_norm")
 
 
-def read_metrics(folder: Path) -> list[Row]:
-    """The rows of a run's `metrics.jsonl`; a last line that was cut short is left out."""
-    rows = []
-    for line in (folder / METRICS_FILE).read_text().splitlines():
+class Journal:
+    """`metrics.jsonl`. Where it cannot be written training goes on, and the rows wait in memory."""
+
+    def __init__(self, path: Path, updates: int) -> None:
+        """Rows behind `updates` belong to updates that will be done again: they are dropped."""
+        self.path = path
+        self._waiting: list[str] = []
+        self._size = 0  # bytes of whole rows
+        if path.exists():
+            kept = [row for row in read_metrics(path.parent) if row["updates"] <= updates]
+            text = "".join(json.dumps(row) + "\n" for row in kept)
+            files.write_text(path, text)
+            self._size = len(text)
+
+    def write(self, row: Row) -> None:
+        """Appends a row, and those that waited; warns once per time that it cannot."""
+        self._waiting.append(json.dumps(row) + "\n")
         try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            break
+            with self.path.open("ab") as file:
+                file.truncate(min(self._size, file.tell()))  # what an earlier attempt left
+                file.write("".join(self._waiting).encode())
+            self._size = self.path.stat().st_size
+            self._waiting.clear()
+        except OSError as error:
+            if len(self._waiting) == 1:
+                reason = f"cannot be written ({error.strerror}); training goes on"
+                warnings.warn(f"{self.path}: {reason}, its rows wait in memory", stacklevel=2)
+
+
+def read_metrics(folder: Path) -> list[Row]:
+    """The rows of a run's `metrics.jsonl`; a line that was cut short or damaged is left out."""
+    rows = []
+    for line in (folder / METRICS_FILE).read_text(errors="replace").splitlines():
+        with contextlib.suppress(json.JSONDecodeError):
+            row = json.loads(line)
+            if isinstance(row, dict) and isinstance(row.get("updates"), int):
+                rows.append(row)
     return rows

@@ -1,21 +1,21 @@
 """Tables are computed once per machine and kept in the user's cache folder.
 
 A cached file's name holds a hash of everything that it follows from: the bundled rooms and the
-source of the modules that compute the tables. Files appear whole or not at all, so that
-processes building at the same time do not disturb each other.
+source of the modules that compute the tables. Files appear whole or not at all, and of processes
+that find none at the same time one computes while the others wait.
 """
 
+import contextlib
 import hashlib
 import importlib
 import inspect
 import os
-import secrets
 import warnings
 from pathlib import Path
 
 import platformdirs
 
-from tdanet_jax import assets
+from tdanet_jax import assets, files
 from tdanet_jax.scenes import ithor, tables
 from tdanet_jax.vocabulary import ALL_TARGETS
 
@@ -57,29 +57,45 @@ def load_tables(progress: tables.Progress | None = None) -> tables.SceneTables:
     written the tables are computed all the same.
     """
     path = folder() / f"ithor-{key()}.npz"
-    checksum = path.with_suffix(".sha256")
-    if path.is_file():
-        if checksum.is_file() and checksum.read_text().strip() == assets.sha256(path):
-            return tables.SceneTables.load(path)
-        warnings.warn(f"{path}: damaged, computed anew", stacklevel=2)
-    result = tables.build(ithor.load_scenes(), progress=progress)
-    try:
-        _store(result, path, checksum)
-    except OSError as error:
-        warnings.warn(f"{path}: not cached ({error.strerror})", stacklevel=2)
+    if (found := _read(path)) is not None:
+        return found
+    with contextlib.ExitStack() as stack:
+        _lock(stack)
+        if (found := _read(path)) is not None:
+            return found
+        if path.exists():
+            warnings.warn(f"{path}: damaged, computed anew", stacklevel=2)
+        result = tables.build(ithor.load_scenes(), progress=progress)
+        try:
+            _store(result, path)
+        except OSError as error:
+            warnings.warn(f"{path}: not cached ({error.strerror})", stacklevel=2)
     return result
 
 
-def _store(result: tables.SceneTables, path: Path, checksum: Path) -> None:
-    """Write beside the final place, then rename: readers see an old file or a whole new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}")
-    note = fresh.with_name(fresh.name + ".sha256")
+def _lock(stack: contextlib.ExitStack) -> None:
+    """Makes other processes wait until `stack` unwinds; where nothing can be written, none need."""
     try:
+        stack.enter_context(files.locked(folder()))
+    except BlockingIOError:
+        warnings.warn("another process computes the rooms' tables: waiting for it", stacklevel=3)
+        stack.enter_context(files.locked(folder(), wait=True))
+    except OSError:
+        return
+    files.remove_partial(folder())
+
+
+def _read(path: Path) -> tables.SceneTables | None:
+    """The cached tables, or None if they are missing or not those whose checksum was written."""
+    try:
+        if path.with_suffix(".sha256").read_text(errors="replace").strip() == assets.sha256(path):
+            return tables.SceneTables.load(path)
+    except OSError:
+        pass
+    return None
+
+
+def _store(result: tables.SceneTables, path: Path) -> None:
+    with files.replacing(path) as fresh:
         result.save(fresh)
-        note.write_text(assets.sha256(fresh) + "\n")
-        os.replace(note, checksum)  # first: no reader shall see tables without their checksum
-        os.replace(fresh, path)
-    finally:
-        fresh.unlink(missing_ok=True)
-        note.unlink(missing_ok=True)
+        files.write_text(path.with_suffix(".sha256"), assets.sha256(fresh) + "\n")

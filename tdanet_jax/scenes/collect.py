@@ -4,11 +4,11 @@ The controller is an argument: this module needs neither Unity nor the `ai2thor`
 """
 
 import json
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from tdanet_jax import files
 from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.scene import GRID
 
@@ -52,6 +52,4 @@ def collect(controller: Any, rooms: Iterable[tuple[str, str]]) -> list[dict[str,
 
 def write_scenes(documents: list[dict[str, Any]], path: Path) -> None:
     """Write a scene file; an existing file is replaced only once the new one is whole."""
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
-    fresh.write_text(json.dumps(documents), encoding="utf-8")
-    os.replace(fresh, path)
+    files.write_text(path, json.dumps(documents))

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle, Wedge
 
+from tdanet_jax import files
 from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.floor_plan import area, footprint
 from tdanet_jax.scenes.geometry import HORIZONS, VIEWS
@@ -56,7 +57,8 @@ def draw(scene: Scene, tables: SceneTables, state: int, path: Path) -> None:
     }
     _draw_plan(plan, scene, tables, state, seen)
     _draw_view(view, tables, state)
-    figure.savefig(path, dpi=110)
+    with files.replacing(path) as fresh:
+        figure.savefig(fresh, dpi=110)
 
 
 def _pose(tables: SceneTables, state: int) -> tuple[np.ndarray, int, int]:

@@ -4,7 +4,6 @@ import json
 
 import jax
 import jax.numpy as jnp
-import pytest
 
 from experiments import benchmark
 from tdanet_jax.classes import Classes
@@ -21,23 +20,6 @@ def test_it_writes_one_json_object_per_figure(ithor, tmp_path):
     assert [row["part"] for row in rows] == ["start", "environment", "environment"]
     assert [row.get("observations") for row in rows] == [None, False, True]
     assert all(row["steps_per_second"] > 0 for row in rows[1:])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--repeats", "0"], "--repeats 0: must be positive"),
-        (["--parts", "everything"], "invalid choice 'everything'"),
-        (["--out", "{folder}"], "exists"),
-    ],
-)
-def test_wrong_arguments_give_one_line(tmp_path, capsys, arguments, message):
-    with pytest.raises(SystemExit) as stopped:
-        benchmark.main([word.format(folder=tmp_path) for word in arguments])
-    said = capsys.readouterr().err
-    assert stopped.value.code == 2
-    assert message in said
-    assert len(said.strip().splitlines()) == 1
 
 
 def test_the_hand_formula_counts_the_kernels_that_a_step_uses():

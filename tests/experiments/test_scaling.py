@@ -3,7 +3,6 @@
 import json
 
 import numpy as np
-import pytest
 
 from experiments import scaling
 from tdanet_jax.config import TrainConfig
@@ -31,21 +30,6 @@ def test_few_rooms_hold_all_types(ithor, glove):
     assert (np.asarray(params.room_scenes)[:, 1] == 1).all()
     more = scaling.with_detections(params, params.max_detections + 9)
     assert len(more.row_class) == len(params.row_class) + 9
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--rooms", "0"], "--rooms: must be positive"),
-        (["--out", "{folder}"], "exists and is not empty"),
-    ],
-)
-def test_wrong_arguments_give_one_line(tmp_path, capsys, arguments, message):
-    (tmp_path / "file").touch()
-    with pytest.raises(SystemExit) as stopped:
-        scaling.main([word.format(folder=tmp_path) for word in arguments])
-    assert stopped.value.code == 2
-    assert message in capsys.readouterr().err
 
 
 def test_it_writes_figures_and_a_plot(tmp_path, monkeypatch, ithor):

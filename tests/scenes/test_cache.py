@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tdanet_jax import files
 from tdanet_jax.scenes import cache, ithor, tables, toy
 
 # Builds (slowly enough to overlap) and prints the tables' version.
@@ -17,7 +18,8 @@ import time
 import numpy as np
 from tdanet_jax.scenes import cache, ithor, toy
 def rooms():
-    time.sleep(1.0)
+    print("building", flush=True)
+    time.sleep(2.0)
     return [toy.random_room(np.random.default_rng(0))]
 ithor.load_scenes = rooms
 print(cache.load_tables().data_version)
@@ -45,7 +47,7 @@ def test_built_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert calls == [(1, 1)]
     forbid_building(monkeypatch)
     assert cache.load_tables().data_version == first.data_version
-    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+    assert sorted(path.suffix for path in files_of(folder)) == [".npz", ".sha256"]
 
 
 @pytest.mark.parametrize("damage", ["flip", "truncate", "empty", "no checksum"])
@@ -82,17 +84,39 @@ def test_a_cache_that_cannot_be_written(folder: Path, monkeypatch: pytest.Monkey
         assert len(cache.load_tables().scenes) == 1
 
 
-def test_two_processes_at_once(tmp_path: Path) -> None:
-    environment = {**os.environ, cache.VARIABLE: str(tmp_path), "PYTHONWARNINGS": "error"}
+def start_building(folder: Path) -> subprocess.Popen[str]:
+    environment = {**os.environ, cache.VARIABLE: str(folder), "PYTHONPATH": os.getcwd()}
     command = [sys.executable, "-c", BUILDER]
-    running = [
-        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
-        for _ in range(3)
-    ]
-    results = {(process.communicate(timeout=120)[0], process.returncode) for process in running}
-    assert len(results) == 1
-    assert results.pop()[1] == 0
-    assert len(list(tmp_path.iterdir())) == 2
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True)
+
+
+def test_of_processes_at_once_one_builds_and_the_others_wait(tmp_path: Path) -> None:
+    running = [start_building(tmp_path) for _ in range(3)]
+    said = [process.communicate(timeout=120) for process in running]
+    assert [process.returncode for process in running] == [0, 0, 0]
+    assert sum("building" in out for out, _ in said) == 1
+    assert len({out.splitlines()[-1] for out, _ in said}) == 1  # the tables' version
+    for out, err in said:
+        assert ("waiting for it" in err) == ("building" not in out)
+        assert "damaged" not in err
+    assert len(files_of(tmp_path)) == 2
+
+
+def test_a_builder_that_is_killed_leaves_no_lock_and_no_litter(tmp_path: Path) -> None:
+    killed = start_building(tmp_path)
+    assert killed.stdout is not None
+    assert killed.stdout.readline() == "building\n"
+    killed.kill()
+    killed.communicate()
+    (tmp_path / f"{files.PARTIAL}{killed.pid}-tables.npz").write_text("half")
+    out, _ = start_building(tmp_path).communicate(timeout=120)
+    assert out.startswith("building\n")
+    assert len(files_of(tmp_path)) == 2
+
+
+def files_of(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.name != files.LOCK_FILE]
 
 
 def test_the_platforms_place_by_default(monkeypatch: pytest.MonkeyPatch) -> None:

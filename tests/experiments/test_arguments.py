@@ -1,0 +1,176 @@
+"""Wrong arguments to any command: one clear line, exit status 2, nothing written.
+
+A new command gets its rows in `CASES`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+from tdanet_jax import config as configs
+from tdanet_jax.config import TrainConfig
+from tests.experiments import command
+
+#: Command -> arguments, typed in a folder made by `folder`, and what the line must contain.
+CASES: dict[str, list[tuple[str, str]]] = {
+    "train_zero_shot": [
+        ("--split 17/5", "--split 17/5: choose one of 22/0, 18/4, 14/8"),
+        ("--model cnn", "--model cnn: choose one of tdanet"),
+        ("--model no.such", "--model no.such: No module named 'no'"),
+        ("--model os.path", "--model os.path: the module has no function `make`"),
+        ("--model ..", "--model ..: "),
+        ("--steps -5", "--steps -5: must be positive"),
+        ("--steps many", "invalid literal for int() with base 10: 'many'"),
+        ("--history=-1", "--history -1: must not be negative"),
+        ("--episodes 0", "--episodes 0: must be positive"),
+        ("--minutes inf", "--minutes inf: must be finite"),
+        ("--num-envs 1.5", "invalid literal for int() with base 10: '1.5'"),
+        ("--learning-rate inf", "--learning-rate inf: must be finite"),
+        ("--entropy-weight nan", "--entropy-weight nan: must be finite"),
+        ("--entropy-weight=-1", "--entropy-weight -1.0: must not be negative"),
+        ("--max-grad-norm 0", "--max-grad-norm 0.0: must be positive"),
+        ("--gamma 1.5", "--gamma 1.5: must be a share between 0 and 1"),
+        ("--seed=-1", "--seed -1: must be between 0 and 4294967295"),
+        ("--seed 99999999999999999999", "--seed 99999999999999999999: must be between 0 and"),
+        ("--rows all", "invalid choice 'all' for argument '--rows'. Expected one of ('class'"),
+        ("--preset fast", "invalid choice 'fast' for argument '--preset'"),
+        ("--stepz 5", "Unrecognized options: --stepz, 5"),
+        ("extra", "Unrecognized options: extra"),
+        ("--out", "Missing value for argument '--out'"),
+        ("--out full", "--out full: exists and is not empty (to go on there: --resume full)"),
+        ("--out full/file", "--out full/file: exists and is not empty"),
+        ("--out full/file/below", "full/file/below: Not a directory"),
+        ("--resume nowhere", "nowhere/config.json: no such file; is this the folder of a run?"),
+        ("--resume nowhere --steps 5", "--resume goes on to the original budget and takes no"),
+        ("--resume full/file", "full/file/config.json: Not a directory"),
+        ("--resume broken", "broken/config.json: Expecting property name"),
+        ("--resume binary", "binary/config.json: 'utf-8' codec can't decode"),
+        ("--resume typed", "typed/config.json: --steps many: must be of type"),
+        ("--tensorboard", "--tensorboard needs tensorboardX: pip install"),
+    ],
+    "evaluate": [
+        ("", "--policy sample needs --checkpoint"),
+        ("--policy random --checkpoint full", "--policy random takes no --checkpoint"),
+        ("--policy random --split 17/5", "--split 17/5: choose one of"),
+        ("--policy random --history", "--policy random has no --history"),
+        ("--checkpoint a --checkpoint a", "--checkpoint: a run is given twice"),
+        ("--checkpoint a --checkpoint b", "several checkpoints need --out"),
+        ("--policy random --seed x", "invalid literal for int() with base 10: 'x'"),
+        ("--policy random --seed=-1", "--seed -1: must be between 0 and"),
+        ("--policy random --out full", "--out full: exists and is not empty"),
+        ("--policy random --out full/file", "--out full/file: exists and is not empty"),
+        ("--policy dance", "invalid choice 'dance' for argument '--policy'"),
+        ("--checkpoint nowhere", "nowhere/config.json: no such file"),
+        ("--checkpoint binary", "binary/config.json: 'utf-8' codec can't decode"),
+        ("--checkpoint bare", "bare: no checkpoint"),
+    ],
+    "benchmark": [
+        ("--repeats 0", "--repeats 0: must be positive"),
+        ("--repeats x", "invalid literal for int() with base 10: 'x'"),
+        ("--devices 0", "--devices 0: must be positive"),
+        ("--environments 8 0", "--environments 0: must be positive"),
+        ("--batches=-5", "--batches -5: must be positive"),
+        ("--precisions int8", "invalid choice 'int8' for argument '--precisions'"),
+        ("--parts everything", "invalid choice 'everything'"),
+        ("--out full", "--out full: exists"),
+    ],
+    "scaling": [
+        ("--rooms 10 0", "--rooms 0: must be positive"),
+        ("--repeats=-1", "--repeats -1: must be positive"),
+        ("--classes 10", "--classes 10: the rooms need at least 117"),
+        ("--detections 3", "--detections 3: the rooms need at least"),
+        ("--out full", "--out full: exists and is not empty"),
+    ],
+    "scenes": [
+        ("", "Expected one of {build"),
+        ("fly", "Unrecognized options: fly"),
+        ("build --wheels wheels", "wheels/procthor-0.0.1.dev2-py3-none-any.whl: sha256 is not"),
+        ("verify --rooms 0", "--rooms 0: must be positive"),
+        ("verify --views x", "invalid literal for int() with base 10: 'x'"),
+        ("inspect", "Missing from scenes inspect: STR"),
+        ("inspect FloorPlan0", "FloorPlan0: no such room; there are FloorPlan1 to FloorPlan430"),
+        ("inspect FloorPlan1 --rotation 90", "--rotation and --horizon need --position"),
+        ("inspect FloorPlan1 --position 0 0 --rotation 50", "rotation 50: not a multiple of 45"),
+        ("inspect FloorPlan1 --position 0 0 --horizon 5", "horizon 5: neither 0 nor 30"),
+        ("inspect FloorPlan1 --position nan 0", "--position nan 0.0: must be finite"),
+        ("inspect FloorPlan1 --out a.doc", "--out a.doc: must end in .png, .svg, .pdf"),
+        ("inspect FloorPlan1 --out no/a.png", "no/a.png: No such file or directory"),
+        ("inspect Lab --scenes nope.json", "nope.json: No such file or directory"),
+        ("import nope.json", "nope.json: No such file or directory"),
+        ("import full", "full: Is a directory"),
+        ("import binary/config.json", "binary/config.json: not JSON"),
+        ("import broken/config.json --out full", "--out full: exists"),
+        ("import broken/config.json", "broken/config.json: not JSON"),
+        ("collect", "collect: name a room, say FloorPlan1=kitchen"),
+        ("collect FloorPlan1", "FloorPlan1: not NAME=TYPE with a type of kitchen"),
+        ("collect FloorPlan1=hall", "FloorPlan1=hall: not NAME=TYPE"),
+    ],
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, with a full folder in it and damaged runs."""
+    written = configs.to_json(TrainConfig())
+    for name, content in {
+        "full/file": b"kept",
+        "broken/config.json": b"{",
+        "binary/config.json": b"\xff\xfe\x00",
+        "typed/config.json": json.dumps(written | {"steps": "many"}).encode(),
+        "bare/config.json": json.dumps(written).encode(),
+        "wheels/procthor-0.0.1.dev2-py3-none-any.whl": b"no wheel",
+    }.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)  # no optional packages
+    return tmp_path
+
+
+def content_of(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def assert_one_line(said: str, message: str) -> None:
+    assert said.startswith("error: ")
+    assert message in said
+    assert len(said.strip().splitlines()) == 1
+    assert "Traceback" not in said
+
+
+def flat(cases: dict[str, list[tuple[str, str]]]) -> list[tuple[str, str, str]]:
+    return [(name, *case) for name, rows in cases.items() for case in rows]
+
+
+@pytest.mark.parametrize(("name", "arguments", "message"), flat(CASES))
+def test_wrong_arguments_give_one_line_and_write_nothing(
+    folder: Path, capsys: pytest.CaptureFixture[str], name: str, arguments: str, message: str
+) -> None:
+    before, folders = content_of(folder), sorted(folder.rglob("*"))
+    with pytest.raises(SystemExit) as stopped:
+        importlib.import_module(f"experiments.{name}").main(arguments.split())
+    assert stopped.value.code == 2
+    assert_one_line(capsys.readouterr().err, message)
+    assert content_of(folder) == before
+    assert sorted(folder.rglob("*")) == folders
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_in_a_process_of_its_own(name: str) -> None:
+    """The same, once for each command, with nothing of the test's process in the way."""
+    arguments, message = CASES[name][0]
+    done = command.run(name, *arguments.split())
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert_one_line(done.stderr, message)
+
+
+def test_every_command_is_in_the_table() -> None:
+    here = Path(importlib.import_module("experiments").__path__[0])
+    commands = {path.stem for path in here.glob("*.py") if "\ndef main(" in path.read_text()}
+    assert commands == set(CASES)
