@@ -89,4 +89,5 @@ def footprint(scene: Scene, k: int) -> np.ndarray:
 def area(outline: np.ndarray) -> float:
     """Of a parallelogram [4, 2], in square metres."""
     a, b, _, d = outline
-    return float(abs(np.linalg.det([b - a, d - a])))
+    (x1, z1), (x2, z2) = b - a, d - a
+    return float(abs(x1 * z2 - z1 * x2))

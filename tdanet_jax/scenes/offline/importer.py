@@ -69,6 +69,11 @@ def read_folder(folder: Path, report: Report) -> Rooms:
     for line in lines:
         report(1.0, line)
     result = Rooms(make_tables(root, rooms), extras)
+    lost = {p for targets in extras.parents.values() for names in targets.values() for p in names}
+    if lost := lost - set(result.tables.classes):
+        report(
+            1.0, f"parents that are no class of these rooms, left out: {', '.join(sorted(lost))}"
+        )
     _forget(parts)
     return result
 
@@ -157,7 +162,7 @@ def _pack(data: SceneData, stamp: list) -> dict[str, np.ndarray]:
     scene, sight = data.scene, data.sight
     note = {
         "stamp": stamp, "name": scene.name, "room_type": scene.room_type, "found": data.found,
-        "missing": data.missing, "objects": [[o.object_id, o.object_class] for o in scene.objects],
+        "noted": data.noted, "objects": [[o.object_id, o.object_class] for o in scene.objects],
     }  # fmt: skip
     return {
         "note": np.frombuffer(json.dumps(note).encode(), np.uint8),
@@ -178,7 +183,7 @@ def _unpack(stored: dict[str, np.ndarray], note: dict) -> SceneData:
         stored["next_position"],
         Sight(*(stored[name] for name in ("state", "owner", "box", "visible"))),
         tuple(note["found"]),
-        tuple(note["missing"]),
+        tuple(note["noted"]),
     )
 
 

@@ -41,7 +41,7 @@ class SceneData:
     next_position: np.ndarray  # [P, 8] int32
     sight: Sight
     found: tuple[str, ...]  # what was there
-    missing: tuple[str, ...]  # what was not, and what it was replaced by
+    noted: tuple[str, ...]  # what was not, or is odd
 
 
 @dataclasses.dataclass
@@ -66,7 +66,7 @@ def read_scene(folder: Path, name: str, room_type: int) -> SceneData:
         raise FileError(folder, f"none of {', '.join(VISIBILITY_FILES)}")
     known = read_visibility(source, grid)
     found = [f"{len(grid.points)} points", f"{source.name} ({len(known.kinds)} objects)"]
-    missing = list(odd)
+    noted = list(odd)
     owners: dict[int, list[str]] | None = None
     if (folder / OBJECT_FILE).is_file():
         owners = read_objects(folder / OBJECT_FILE, grid, known)
@@ -75,7 +75,7 @@ def read_scene(folder: Path, name: str, room_type: int) -> SceneData:
     if (folder / BOX_FILE).is_file():
         boxes = read_boxes(folder / BOX_FILE, grid)
     else:
-        missing.append(f"{BOX_FILE}: visibility alone, no detections")
+        noted.append(f"no {BOX_FILE}, so no detections")
     rows = _Rows(folder / BOX_FILE, known, owners)
     rows.add(boxes)
     scene, sight = rows.finish(name, room_type, grid.points)
@@ -83,8 +83,8 @@ def read_scene(folder: Path, name: str, room_type: int) -> SceneData:
     if boxed:
         found.append(f"{BOX_FILE} ({boxed} boxes)")
     if boxed and len(sight.box) > boxed:
-        missing.append(f"{len(sight.box) - boxed} times an object is visible without a box")
-    return SceneData(scene, next_position, sight, tuple(found), tuple(missing))
+        noted.append(f"{len(sight.box) - boxed} times an object is visible and has no box")
+    return SceneData(scene, next_position, sight, tuple(found), tuple(noted))
 
 
 def read_grid(path: Path) -> Grid:
@@ -391,6 +391,6 @@ class _Rows:
 
 
 def describe(data: SceneData) -> str:
-    """One line: what a folder held and what was missing."""
+    """One line: what a folder held, what was missing and what is odd."""
     line = f"{data.scene.name}: {', '.join(data.found)}"
-    return f"{line}; missing: {', '.join(data.missing)}" if data.missing else line
+    return f"{line}; noted: {', '.join(data.noted)}" if data.noted else line
