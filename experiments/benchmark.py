@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from tdanet_jax.task import Task
 
 Row = dict[str, Any]
-Part = Literal["tables", "machine", "environment", "rollout", "update", "evaluation", "decision"]
+Part = Literal[
+    "tables", "import", "machine", "environment", "rollout", "update", "evaluation", "decision"
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +46,7 @@ class Command:
 
     parts: tuple[Part, ...] = (
         "tables",
+        "import",
         "machine",
         "environment",
         "rollout",
@@ -107,6 +110,8 @@ def measure(command: Command) -> Iterator[Row]:
     if "tables" in command.parts:
         yield tables_row()
     task = load_task(TrainConfig(data=command.data))
+    if "import" in command.parts:
+        yield import_row(task)
     peak = None
     if "machine" in command.parts:
         machine = machine_row(command.repeats)
@@ -176,6 +181,36 @@ def tables_row() -> Row:
         "load_seconds": round(loaded - saved, 2),
         "peak_memory_gb": round(peak / 1e9, 2),
         "file_mb": round(size / 1e6, 1),
+    }
+
+
+def import_row(task: Task) -> Row:
+    """Rooms out to the original offline layout, and in again by the command that a user types;
+    the command's own peak memory."""
+    import resource
+    import subprocess
+    import sys
+    import tempfile
+
+    from tdanet_jax.scenes.offline import exporter
+
+    with tempfile.TemporaryDirectory() as place:
+        folder, out = Path(place) / "original", Path(place) / "rooms.npz"
+        began = time.perf_counter()
+        exporter.write_folder(task.tables, folder, lambda share, name: None)
+        written = time.perf_counter()
+        command = [sys.executable, "-m", "experiments.scenes", "import", "--from", str(folder)]
+        subprocess.run([*command, "--out", str(out)], check=True, capture_output=True)
+        read = time.perf_counter()
+        size = sum(path.stat().st_size for path in folder.rglob("*.json"))
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    return {
+        "part": "import",
+        "rooms": len(task.tables.scenes),
+        "folder_mb": round(size / 1e6, 1),
+        "export_seconds": round(written - began, 2),
+        "import_seconds": round(read - written, 2),
+        "peak_memory_gb": round(peak / 1e9, 2),
     }
 
 

@@ -126,3 +126,16 @@ def test_every_target_occurs_in_the_rooms_that_ask_for_it(
 )
 def test_labels_split_into_lower_case_words(label: str, words: tuple[str, ...]) -> None:
     assert class_words(label) == words
+
+
+def test_a_split_within_fewer_rooms_and_classes() -> None:
+    split = make_split("18/4")
+    left = split.within({"FloorPlan1", "FloorPlan230", "FloorPlan301", "Lab"}, {"Mug", "Laptop"})
+    assert left.train_scenes == ("FloorPlan1", "FloorPlan301")
+    assert left.eval_scenes == ("FloorPlan230",)
+    assert left.hidden == {"Laptop"}
+    assert left.seen["kitchen"] == ("Mug",)
+    assert left.seen["bedroom"] == ()
+    assert left.unseen["living_room"] == ("Laptop",)
+    with pytest.raises(ValueError, match="none of the training rooms of split 18/4, FloorPlan1 to"):
+        split.within({"Lab"}, {"Mug"})

@@ -11,6 +11,7 @@ import pytest
 
 from tdanet_jax import words
 from tdanet_jax.scenes import SceneTables
+from tdanet_jax.untrusted import FileError
 from tdanet_jax.words import WordVectors
 
 SMALL = WordVectors(
@@ -97,3 +98,76 @@ def test_the_asset_keeps_frequent_words_and_those_of_the_classes(
     assert (
         words.build_asset(wheel, tmp_path, ["CoffeeMug", "The", "Unlisted"]).read_bytes() == first
     )
+
+
+def write_glove(path: Path, words_: list[str], width: int = 4) -> np.ndarray:
+    vectors = np.random.default_rng(0).normal(size=(len(words_), width)).round(4)
+    lines = [" ".join([word, *map(str, row)]) for word, row in zip(words_, vectors, strict=True)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return vectors.astype(np.float32)
+
+
+def test_a_text_file_of_glove(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "glove.6B.4d.txt"
+    listed = ["the", "coffee", "xqz", "rareword", "machine", "é"]
+    vectors = write_glove(path, listed)
+    found = words.load(path)
+    np.testing.assert_allclose(found.embed("CoffeeMachine", None), vectors[[1, 4]].mean(0), 1e-5)
+    monkeypatch.setattr(words, "ASSET_WORDS", 1)
+    assert set(words.load(path, ["Rareword"]).index) == {"the", "coffee", "machine", "rareword"}
+    assert found.missing(["CoffeeMachine", "TableTop", "?"]) == ["TableTop (table, top)",
+                                                                "? (no words)"]  # fmt: skip
+    with pytest.raises(ValueError, match=r"TableTop \(table, top\), Xy \(xy\)"):
+        found.table(["Coffee", "TableTop", "Xy"])
+
+
+def test_a_file_with_a_vector_per_class_name(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "glove_map300d.hdf5"
+    with h5py.File(path, "w") as file:
+        file["CoffeeMachine"], file["Mug"] = np.arange(300.0), np.ones(300)
+    found = words.load(path)
+    np.testing.assert_array_equal(found.embed("coffee machine", None), np.arange(300))
+    assert found.missing(["Mug", "CoffeeMug"]) == ["CoffeeMug (coffee)"]
+    with h5py.File(path, "a") as file:
+        file["Bread"] = np.ones(299)
+    with pytest.raises(FileError, match="Bread is not a vector as wide as the others"):
+        words.load(path)
+
+
+def test_npz_files_of_vectors(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    vectors = np.eye(2, 3, dtype=np.float32)
+    np.savez(path, words=np.array(["mug", "bread"]), vectors=vectors)
+    np.testing.assert_array_equal(words.load(path).embed("Bread", None), [0, 1, 0])
+    np.savez(path, words=np.frombuffer(b"mug\nbread", np.uint8), vectors=vectors)
+    np.testing.assert_array_equal(words.load(path).embed("Bread", None), [0, 1, 0])
+    for arrays in (
+        {"words": np.array(["mug"]), "vectors": vectors},
+        {"words": np.zeros(2), "vectors": vectors},
+        {"vectors": vectors},
+        {"words": np.array(["mug", "bread"]), "vectors": vectors * np.nan},
+    ):
+        np.savez(path, **arrays)  # type: ignore[arg-type]
+        with pytest.raises(FileError, match=r"a\.npz: "):
+            words.load(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [("", "no word vectors"), ("a 1 2\nb 1\n", "line 2 is not"), ("a 1 x\n", "line 1 is not"),
+     ("a 1 nan\n", "line 1 is not"), ("a\n", "line 1 is not")],
+)  # fmt: skip
+def test_text_files_that_hold_no_vectors(tmp_path: Path, text: str, reason: str) -> None:
+    path = tmp_path / "glove.txt"
+    path.write_text(text)
+    with pytest.raises(FileError, match=rf"glove\.txt: {reason}"):
+        words.load(path)
+
+
+def test_files_of_other_kinds(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="word vectors are a"):
+        words.load(tmp_path / "glove.bin")
+    for name in ("a.txt", "a.npz", "a.hdf5"):
+        with pytest.raises(FileError, match=rf"{name}: no such file"):
+            words.load(tmp_path / name)

@@ -1,0 +1,138 @@
+"""Rooms and word vectors from files, through the commands that a user types."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tdanet_jax
+from experiments import evaluate, scenes, train_zero_shot
+from tdanet_jax.agent import Detection
+from tdanet_jax.scenes import SceneTables, dataset
+from tests import original
+from tests.conftest import SOME_ROOMS
+from tests.experiments.test_train_zero_shot import TINY
+
+
+@pytest.fixture(autouse=True)
+def parts_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Imports keep their parts in a cache of their own; the bundled tables stay where they are."""
+    from tdanet_jax.scenes.offline import importer
+
+    monkeypatch.setattr(importer, "_parts_folder", lambda root: tmp_path / "parts")
+
+
+def fails(command, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        command.main(arguments)
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert message.startswith("error: ")
+    assert message.count("\n") == 1
+    return message
+
+
+def test_the_miniature_trains_and_evaluates(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Old-style links, names of AI2-THOR 1.0, published parents, graph and episodes."""
+    monkeypatch.chdir(tmp_path)
+    source = original.write_all(tmp_path / "original")
+    scenes.main(["import", "--from", str(source), "--out", "rooms.npz"])
+    said = capsys.readouterr().out
+    assert "FloorPlan21: 3 points, visible_object_map.json (3 objects)" in said
+    assert "c2p_prob.json: parents of 1 targets" in said
+    assert "left out: Sink, Toaster" in said
+    vectors = np.random.default_rng(0).normal(size=(4, 7)).round(3)
+    names = ["mug", "apple", "tabletop", "table"]
+    lines = [" ".join(map(str, [name, *row])) for name, row in zip(names, vectors, strict=True)]
+    Path("glove.txt").write_text("\n".join(lines))
+    files = ["--data", "rooms.npz", "--word-vectors", "glove.txt"]
+    run = ["--steps", "800", *TINY, "--out", "run"]
+    message = fails(train_zero_shot, [*files, *run], capsys)
+    assert "no word vectors for TableTop (top)" in message
+    assert not Path("run").exists()
+
+    with Path("glove.txt").open("a") as file:
+        file.write("\ntop 1 0 0 0 0 0 0\n")
+    train_zero_shot.main([*files, *run])
+    results = json.loads(Path("run/results.json").read_text())
+    assert results["data_version"] == dataset.load(Path("rooms.npz")).tables.data_version
+    assert results["seen"]["L>=1"]["n"] == 2, "the published episodes"
+    assert results["unseen"] is None
+    assert str(tmp_path / "rooms.npz") in Path("run/results.md").read_text()
+
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")  # files are found from any folder
+    evaluate.main(["--checkpoint", "../run", "--out", "again"])
+    assert json.loads(Path("again/results.json").read_text())["seen"] == results["seen"]
+    agent = tdanet_jax.load("../run")
+    seen = [Detection("table top", 0, 0, 1, 1)]
+    _, decision = agent.act(agent.start(), seen, target="mug")
+    assert decision.probabilities.shape == (6,)
+
+
+@pytest.mark.slow
+def test_eight_exported_rooms_train_and_evaluate(
+    ithor: SceneTables, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scenes.main(["export", "--out", "out", "--scenes", *SOME_ROOMS])
+    scenes.main(["import", "--from", "out", "--out", "rooms.npz"])
+    data = ["--data", "rooms.npz"]
+    train_zero_shot.main([*data, "--steps", "4000", *TINY, "--out", "run"])
+    evaluate.main(["--checkpoint", "run", "--policy", "greedy", "--out", "greedy"])
+    evaluate.main(["--policy", "shortest_path", *data, "--out", "shortest"])
+    results = json.loads(Path("shortest/results.json").read_text())
+    assert results["seen"]["L>=1"]["SR"] == results["unseen"]["L>=1"]["SPL"] == 100
+    assert results["seen"]["L>=1"]["n"] >= 500
+    # A run goes to other rooms, too: the bundled ones, as a file.
+    ithor.save(Path("bundled.npz"))
+    evaluate.main(["--checkpoint", "run", "--data", "bundled.npz", "--out", "bundled"])
+    results = json.loads(Path("bundled/results.json").read_text())
+    assert results["seen"]["L>=1"]["n"] == 1000
+
+
+def test_wrong_arguments_give_one_line_and_write_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    source = original.write_all(tmp_path / "original")
+    (tmp_path / "taken").mkdir()
+    (source / "FloorPlan21_physics" / "graph.json").write_text('{"nodes": [], "links": [{}]}')
+    (tmp_path / "own.json").write_text("{}")
+    before = sorted(tmp_path.rglob("*"))
+    for command, arguments, reason in (
+        (scenes, ["import"], "a scene file, or --from a folder"),
+        (scenes, ["import", "own.json", "--from", "original"], "not both"),
+        (scenes, ["import", "own.json", "--features"], "--features: needs --from"),
+        (scenes, ["import", "--from", "nowhere"], "nowhere: no folder"),
+        (scenes, ["import", "--from", "original", "--out", "taken"], "--out taken: exists"),
+        (scenes, ["import", "--from", "original", "--out", "no/a.npz"], "no such folder"),
+        (scenes, ["export", "--out", "taken"], "--out taken: exists"),
+        (scenes, ["export", "--out", "a", "--scenes", "FloorPlan0"], "FloorPlan0: no such scene"),
+        (scenes, ["export", "--out", "a", "--data", "own.json"], "own.json: not an npz archive"),
+        (scenes, ["inspect", "FloorPlan1", "--data", "b.npz"], "b.npz: no such file"),
+        (evaluate, ["--policy", "random", "--data", "b.npz"], "b.npz: no such file"),
+        (train_zero_shot, ["--data", "own.json"], "own.json: not an npz archive"),
+        (train_zero_shot, ["--word-vectors", "b.txt"], "b.txt: no such file"),
+        (scenes, ["import", "--from", "original", "--out", "a.npz"],
+         "graph.json: a link's source None is not among the nodes"),
+    ):  # fmt: skip
+        assert reason in fails(command, arguments, capsys)
+        found = [p for p in tmp_path.rglob("*") if "parts" not in str(p)]
+        assert sorted(found) == before
+
+
+def test_help_is_quick_and_names_both_sources() -> None:
+    """The commands import nothing heavy before they know what to do."""
+    code = "import sys; from experiments import scenes, evaluate; assert 'jax' not in sys.modules"
+    environment = os.environ | {"PYTHONPATH": os.getcwd()}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)

@@ -1,0 +1,147 @@
+"""Parents, class graph and published episodes, and how a task uses them."""
+
+import json
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tdanet_jax import episodes, zero_shot
+from tdanet_jax.config import TrainConfig
+from tdanet_jax.scenes.dataset import Rooms
+from tdanet_jax.scenes.offline import extras, importer
+from tdanet_jax.task import make_task
+from tdanet_jax.untrusted import FileError
+from tdanet_jax.words import WordVectors
+from tests import original
+
+
+@pytest.fixture
+def rooms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rooms:
+    monkeypatch.setenv("TDANET_CACHE", str(tmp_path / "cache"))
+    scenes = original.write_all(tmp_path / "original")
+    return importer.read_folder(scenes, lambda share, line: None)
+
+
+def test_what_lies_beside_the_scenes_is_found(rooms: Rooms) -> None:
+    found = rooms.extras
+    assert found is not None
+    assert found.parents == {"kitchen": {"Mug": {"TableTop": 0.25, "Sink": 0.5, "Toaster": 0.4}}}
+    assert [(e.part, e.scene, e.z, e.rotation, e.horizon, e.target) for e in found.episodes] == [
+        ("test", "FloorPlan21", 0.0, 45, 0, "Mug"),
+        ("test", "FloorPlan21", 0.5, 180, 0, "Mug"),
+        ("val", "FloorPlan21", 0.0, 45, 0, "Mug"),
+    ]
+    graph = found.class_graph(("Mug", "Sink", "Apple"))
+    assert graph is not None
+    assert graph.tolist() == [[5, 0, 4], [0, 0, 0], [1, 0, 0]]  # of 0 to 15, row by row
+
+
+def test_a_task_takes_published_parents_and_episodes(rooms: Rooms, glove: WordVectors) -> None:
+    task = make_task(TrainConfig(), rooms.tables, glove, rooms.extras)
+    mug, table = task.tables.targets.index("Mug"), task.tables.classes.index("TableTop")
+    # Sink is no class of these rooms, Toaster is unseen; R_p is taken as it is.
+    assert task.train_params.parent_class[mug].tolist() == [table, -1, -1]
+    assert task.train_params.parent_reward[mug].tolist() == [0.25, 0, 0]
+    lists = episodes.load(task.tables, task.split, task.extras)
+    assert list(lists) == ["seen"]
+    assert lists["seen"].pose.tolist() == [48 + 2, 48 + 32 + 8]
+    assert set(lists["seen"].target) == {mug}
+    assert task.classes.edges
+
+
+def test_without_published_episodes_they_are_drawn(rooms: Rooms, glove: WordVectors) -> None:
+    task = make_task(TrainConfig(), rooms.tables, glove, extras.Extras())
+    first = episodes.load(task.tables, task.split, task.extras)
+    again = episodes.load(task.tables, task.split, task.extras)
+    assert len(first["seen"]) == episodes.EPISODES_PER_ROOM_TYPE
+    np.testing.assert_array_equal(first["seen"].pose, again["seen"].pose)
+    assert {task.tables.scenes[i] for i in task.tables.position_scene[first["seen"].pose >> 4]} == {
+        "FloorPlan21"
+    }
+
+
+def test_rooms_that_a_split_cannot_use(rooms: Rooms, glove: WordVectors) -> None:
+    with pytest.raises(ValueError, match="none of the evaluation rooms of split 18/4"):
+        make_task(TrainConfig(), rooms.tables.subset(["FloorPlan1"]), glove, rooms.extras)
+    blind = zero_shot.hide_classes(rooms.tables, {"Mug"})
+    with pytest.raises(ValueError, match="no room holds a target class that can be reached"):
+        make_task(TrainConfig(), blind, glove, rooms.extras)
+
+
+def test_broken_parents(tmp_path: Path) -> None:
+    path = tmp_path / "c2p_prob.json"
+    for content, reason in (
+        ({"Hall": {}}, "room 'Hall' is not one of"),
+        ({"Kitchen": []}, "no targets"),
+        ({"Kitchen": {"Mug": 3}}, "no parents"),
+        ({"Kitchen": {"Mug": {"Sink": "x"}}}, "Sink is not a number"),
+        ({"Kitchen": {"Mug": {"Sink": -1}}}, "a reward below 0"),
+        ([], "not a JSON object"),
+    ):
+        path.write_text(json.dumps(content))
+        with pytest.raises(FileError, match=rf"c2p_prob\.json: .*{reason}"):
+            extras.read_parents(path)
+
+
+def test_broken_graphs(tmp_path: Path) -> None:
+    names, matrix = tmp_path / "objects.txt", tmp_path / "adjmat.dat"
+    for text, value, reason in (
+        ("A\nB\n", np.eye(3), r"adjmat\.dat: shape \(3, 3\) is not that of 2 classes"),
+        ("A\nA\n", np.eye(2), r"objects\.txt: not a list of different class names"),
+        ("", np.eye(0), r"objects\.txt: not a list"),
+        ("A\nB\n", np.full((2, 2), np.nan), r"adjmat\.dat: holds NaN"),
+        ("A\nB\n", -np.eye(2), r"adjmat\.dat: holds .* a weight below 0"),
+        ("A\nB\n", {"a": 1}, r"adjmat\.dat: something other than an array"),
+    ):
+        names.write_text(text)
+        matrix.write_bytes(original.torch_save(value))
+        with pytest.raises(FileError, match=reason):
+            extras.read_graph(names, matrix)
+
+
+class Command:
+    """A pickle that would make a file."""
+
+    def __init__(self, made: Path) -> None:
+        self.made = made
+
+    def __reduce__(self) -> Any:
+        return os.system, (f"touch {self.made}",)
+
+
+def test_broken_episodes(tmp_path: Path, rooms: Rooms) -> None:
+    grids = {"FloorPlan1": extras.Grid(rooms.tables.position[:3])}
+    path, made = tmp_path / "kitchen_test.pkl", tmp_path / "made"
+    with original.fake_torch():
+        [good] = original.episodes([("FloorPlan1", 0.25, 90, "Mug")])
+        [off] = original.episodes([("FloorPlan1", 0.30, 90, "Mug")])
+        [turned] = original.episodes([("FloorPlan1", 0.25, 91, "Mug")])
+        [inside] = original.episodes([("FloorPlan1", float("nan"), 90, "Mug")])
+        cases = [
+            ([good], None),
+            (good, "not a list of episodes"),
+            ([3], "episode 0: no scene, state and goal_object_type"),
+            ([{**good, "scene": "../../etc/passwd"}], "is not an iTHOR scene"),
+            ([{**good, "state": {"x": 0}}], "its state is no ThorAgentState"),
+            ([{**good, "glove_embedding": "text"}], "something other than an array"),
+            ([off], "is not on the grid"),
+            ([turned], "rotation or horizon"),
+            ([inside], "z is not finite"),
+            ([good, Command(made)], "system"),
+        ]
+        written = [(pickle.dumps(content), reason) for content, reason in cases]
+    for data, reason in written:
+        path.write_bytes(data)
+        if reason is None:
+            assert len(extras.read_episodes(path, grids)[0]) == 1
+            continue
+        with pytest.raises(FileError, match=rf"kitchen_test\.pkl: .*{reason}"):
+            extras.read_episodes(path, grids)
+    assert not made.exists()
+    (tmp_path / "kitchen_train.pkl").write_bytes(written[0][0])
+    with pytest.raises(FileError, match="not named"):
+        extras.read_episodes(tmp_path / "kitchen_train.pkl", grids)

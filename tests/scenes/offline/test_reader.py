@@ -1,0 +1,250 @@
+"""A scene's folder: every variant of its files, by hand, and everything that is refused."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tdanet_jax.scenes.offline import layout, reader
+from tdanet_jax.scenes.offline.reader import SceneData
+from tdanet_jax.untrusted import FileError
+from tests import original
+from tests.original import APPLE, KEYS, MUG, TABLE
+
+AHEAD = [0, 1, 2]  # places in KEYS: 16 a point
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    original.write_room(tmp_path / "FloorPlan1")
+    return tmp_path / "FloorPlan1"
+
+
+def read(folder: Path) -> SceneData:
+    return reader.read_scene(folder, "FloorPlan1", 0)
+
+
+def change(folder: Path, name: str, edit: Any) -> None:
+    """Rewrites a file: `edit` gets its content and changes or replaces it."""
+    content = json.loads((folder / name).read_text())
+    (folder / name).write_text(json.dumps(edit(content) or content))
+
+
+def rows(data: SceneData) -> set[tuple[int, str, tuple[float, ...], bool]]:
+    """State, object, box in pixels, and whether it is visible, of every row."""
+    return {
+        (int(s), data.scene.objects[o].object_id, tuple((b / 16).tolist()), bool(v))
+        for s, o, b, v in zip(*vars(data.sight).values(), strict=True)
+    }
+
+
+def test_the_miniature_by_hand(folder: Path) -> None:
+    data = read(folder)
+    assert data.scene.points.tolist() == [[-0.001, 0.9, 0.25 * i] for i in range(3)]
+    nowhere = tuple(value / 16 for value in reader.NO_BOX)
+    assert rows(data) == {
+        (16, MUG, (140, 150, 160, 170), False),
+        (16, TABLE, (100, 160, 200, 300), True),
+        (32, MUG, (130, 140, 170, 180), True),  # the larger box is that of the visible mug
+        (32, "Mug|unnamed|0", (5, 150, 15, 160), False),
+        (32, APPLE, (0, 0, 10, 20), False),
+        (32, TABLE, nowhere, True),
+    }
+    steps = [[point] * 8 for point in range(3)]
+    steps[0][0], steps[1][0], steps[1][4], steps[2][4] = 1, 2, 0, 1
+    assert data.next_position.tolist() == steps
+    places = {item.object_id: item.box[0].tolist() for item in data.scene.objects}
+    assert places[MUG] == [0.0, 1.0, 1.5]
+    assert np.isnan(places[APPLE]).all()
+    assert "3 points, visible_object_map.json (3 objects)" in reader.describe(data)
+    assert "1 times an object is visible and has no box" in reader.describe(data)
+
+
+def test_links_by_name_and_links_called_edges_are_the_same(folder: Path) -> None:
+    before = read(folder).next_position
+
+    def new_style(graph: dict) -> None:
+        graph["links"] = [{k: KEYS[i] for k, i in link.items()} for link in graph["links"]]
+
+    change(folder, "graph.json", new_style)
+    np.testing.assert_array_equal(read(folder).next_position, before)
+    change(folder, "graph.json", lambda graph: graph.update(edges=graph.pop("links")))
+    np.testing.assert_array_equal(read(folder).next_position, before)
+
+
+def test_an_undirected_graph_has_every_link_both_ways(folder: Path) -> None:
+    def undirect(graph: dict) -> None:
+        links = graph["links"]
+        graph["directed"] = False
+        graph["links"] = [link for link in links if link["source"] < link["target"]]
+
+    before = read(folder)
+    change(folder, "graph.json", undirect)
+    # A step back along heading 180 is another state's link, so a step ahead gives none back.
+    after = read(folder)
+    assert after.next_position[:, 0].tolist() == before.next_position[:, 0].tolist()
+
+
+def test_oddities_of_a_graph_are_counted(folder: Path) -> None:
+    def edit(graph: dict) -> None:
+        links = graph["links"]
+        links.remove({"source": 0, "target": 16})  # a step at horizon 0 alone
+        links.remove({"source": 2, "target": 4})  # a turn
+        links.append({"source": 0, "target": 32})  # two steps at once
+        graph["nodes"][40:40] = [{"id": KEYS[5].replace("-0.00", "0.00")}]
+        for link in links:
+            for end in link:
+                link[end] += link[end] >= 40
+
+    change(folder, "graph.json", edit)
+    data = read(folder)
+    assert data.next_position[0, 0] == 1
+    assert set(data.noted) >= {
+        "1 steps at one horizon alone, taken as open at both",
+        "1 turns without a link, taken as possible",
+        "1 links that no action takes, left out",
+    }
+
+
+def test_states_without_a_node(folder: Path) -> None:
+    def cut(graph: dict) -> None:
+        graph["nodes"] = graph["nodes"][:32]
+        graph["links"] = [link for link in graph["links"] if max(link.values()) < 32]
+
+    change(folder, "graph.json", cut)
+    data = read(folder)
+    assert "16 states not in the graph" in data.noted
+    assert data.next_position[1, 0] == 1
+
+
+def test_raw_metadata_in_place_of_the_map(folder: Path) -> None:
+    before = read(folder)
+    (folder / "visible_object_map.json").unlink()
+    kinds = {MUG: "Mug", TABLE: "TableTop", APPLE: "Apple"}
+    metadata = {
+        key: {
+            "objects": [
+                {"objectId": name, "objectType": kind, "visible": key in original.VISIBLE[name]}
+                for name, kind in kinds.items()
+            ],
+            "agent": {"cameraHorizon": 0.0},
+        }
+        for key in KEYS
+    }
+    (folder / "metadata.json").write_text(json.dumps(metadata))
+    after = read(folder)
+    assert rows(after) == rows(before)
+    assert "metadata.json (3 objects)" in after.found
+
+
+def test_the_name_with_the_distance_goes_first(folder: Path) -> None:
+    (folder / "visible_object_map_1.5.json").write_text(json.dumps({MUG: []}))
+    assert "visible_object_map_1.5.json (1 objects)" in read(folder).found
+
+
+def test_without_boxes_there_is_visibility_alone(folder: Path) -> None:
+    (folder / "objects_bb.json").unlink()
+    data = read(folder)
+    assert (data.sight.box == reader.NO_BOX).all()
+    assert data.sight.visible.tolist() == [True] * 3
+    assert "no objects_bb.json, so no detections" in data.noted
+
+
+def test_keys_with_and_without_a_sign_are_one_state(folder: Path) -> None:
+    change(folder, "objects_bb.json", lambda boxes: boxes.update({"0.00|0.50|0|0": {}}))
+    before = read(folder)
+    change(folder, "visible_object_map.json", lambda seen: seen.update({MUG: ["0.00|0.50|0|0"]}))
+    assert rows(read(folder)) == rows(before)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("Mug|+00.10|+00.93|-01.20", "Mug"), ("Sink|+00.10|+00.93|-01.20|SinkBasin", "SinkBasin"),
+     ("Apple|+00.10|+00.93|-01.20|AppleSliced_3", "AppleSliced"), ("Mug", "Mug"),
+     ("Cup|surface|2|+01.00|7", "Cup")],
+)  # fmt: skip
+def test_classes_in_ids(name: str, kind: str) -> None:
+    assert reader.class_of(name) == kind
+
+
+@pytest.mark.parametrize(
+    ("x", "z", "key"),
+    [(0.0, 1.25, "0.00|1.25|45|30"), (-0.0, -0.25, "-0.00|-0.25|45|30"),
+     (-1.1e-7, 10.5, "-0.00|10.50|45|30"), (0.125, -0.005, "0.12|-0.01|45|30")],
+)  # fmt: skip
+def test_keys_are_the_reference_controllers(x: float, z: float, key: str) -> None:
+    assert layout.state_key(x, z, 45, 30) == key
+
+
+def test_points_off_whole_quarters_have_keys(tmp_path: Path) -> None:
+    grid = layout.Grid(np.array([[0.125, 0.9, -0.875], [0.375, 0.9, -0.875]]))
+    for point in grid.points:
+        key = layout.state_key(point[0], point[2], 0, 0)
+        assert grid.state(tmp_path, key) == 16 * (point[0] > 0.2)
+
+
+BAD: list[tuple[str, Any, str]] = [
+    ("grid.json", lambda c: {"x": 0}, "not a list of points"),
+    ("grid.json", lambda c: [3], "point 0 is not x, y, z"),
+    ("grid.json", lambda c: c[0].update(x="0"), "x of point 0 is not a number"),
+    ("grid.json", lambda c: c[0].update(x=1e9), "x of point 0 is not finite"),
+    ("grid.json", lambda c: c[0].update(x=0.1), "off the 0.25 m grid"),
+    ("grid.json", lambda c: c[:2], None),
+    ("graph.json", lambda c: [1], "not a node-link graph"),
+    ("graph.json", lambda c: c.pop("links") and None, "not a node-link graph"),
+    ("graph.json", lambda c: c["links"].append({"source": 0, "target": 48}), "target 48 is not"),
+    ("graph.json", lambda c: c["links"].append({"source": "9.00|0.00|0|0", "target": 0}),
+     "source '9.00|0.00|0|0' is not among the nodes"),
+    ("graph.json", lambda c: c["links"].append(3), "source None"),
+    ("graph.json", lambda c: c["nodes"].append({"id": "9.00|0.00|0|0"}), "is not on the grid"),
+    ("graph.json", lambda c: c["nodes"].append({"id": "-0.00|0.10|0|0"}), "is not on the grid"),
+    ("graph.json", lambda c: c["nodes"].append({"id": "-0.00|0.00|50|0"}), "rotation or horizon"),
+    ("graph.json", lambda c: c["nodes"].append({"id": "-0.00|0.00|0|60"}), "rotation or horizon"),
+    ("graph.json", lambda c: c["nodes"].append({"id": "../../x"}), "is not x|z|rotation|horizon"),
+    ("graph.json", lambda c: c["nodes"].append({"id": 7}), "a state key that is no text"),
+    ("visible_object_map.json", lambda c: c.update({MUG: ["9.00|0.00|0|0"]}), "not on the grid"),
+    ("visible_object_map.json", lambda c: c.update({MUG: 3}), "neither a list of states"),
+    ("visible_object_map.json", lambda c: {KEYS[0]: {"objects": [3]}}, "an object without"),
+    ("visible_object_map.json", lambda c: {"": []}, "an object without a name"),
+    ("objects_bb.json", lambda c: c.update({"9.00|0.00|0|0": {}}), "is not on the grid"),
+    ("objects_bb.json", lambda c: c.update({KEYS[0]: []}), "not classes with boxes"),
+    ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug": [1, 2, 3]}}), "four numbers a box"),
+    ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug": [0, 0, 1, None]}}), "is no number"),
+    ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug": [0, 0, 1, 302]}}), "not in the image"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", range(len(BAD)))
+def test_what_contradicts_the_layout_names_file_and_reason(folder: Path, case: int) -> None:
+    name, edit, reason = BAD[case]
+    change(folder, name, edit)
+    with pytest.raises(FileError) as error:
+        read(folder)
+    if reason is None:  # the other files then name a point that is gone
+        name, reason = "graph.json", "is not on the grid"
+    assert name in str(error.value)
+    assert reason in str(error.value)
+    assert str(error.value).isprintable()
+
+
+@pytest.mark.parametrize("value", ["NaN", "-Infinity", "1e999", "9" * 400])
+def test_pixels_that_are_not_finite(folder: Path, value: str) -> None:
+    text = (folder / "objects_bb.json").read_text().replace("[140", f"[{value}")
+    (folder / "objects_bb.json").write_text(text)
+    with pytest.raises(FileError, match=r"objects_bb\.json: "):
+        read(folder)
+
+
+@pytest.mark.parametrize("name", ["grid.json", "graph.json", "objects_bb.json",
+                                  "visible_object_map.json"])  # fmt: skip
+def test_missing_and_truncated_files(folder: Path, name: str) -> None:
+    whole = (folder / name).read_text()
+    (folder / name).write_text(whole[: len(whole) // 2])
+    with pytest.raises(FileError, match=rf"{name}: not JSON"):
+        read(folder)
+    (folder / name).unlink()
+    if name != "objects_bb.json":
+        with pytest.raises(FileError, match=name):
+            read(folder)

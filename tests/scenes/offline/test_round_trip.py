@@ -1,0 +1,256 @@
+"""Out and in again: the folder that we write holds what the tables hold, in the layout's terms."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tdanet_jax import words
+from tdanet_jax.reward import find_parents, named_parents, published_parents
+from tdanet_jax.scenes import SceneTables, dataset, tables, toy
+from tdanet_jax.scenes.offline import exporter, importer, reader
+from tdanet_jax.scenes.offline.layout import OBJECT_FILE, state_keys
+from tdanet_jax.untrusted import FileError, hdf5
+from tdanet_jax.vocabulary import TARGETS, make_split
+
+
+def silent(share: float, line: str) -> None:
+    """Reports nothing."""
+
+
+@pytest.fixture(autouse=True)
+def cache_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TDANET_CACHE", str(tmp_path / "cache"))
+
+
+def assert_equal(ours: SceneTables, theirs: SceneTables) -> None:
+    """Equal but for classes that do not occur and targets that are none."""
+    whole = dataset.with_known_targets(ours)
+    for field in dataclasses.fields(SceneTables):
+        a, b = getattr(whole, field.name), getattr(theirs, field.name)
+        if field.name == "object_class":
+            a, b = np.array(ours.classes)[a], np.array(theirs.classes)[b]
+        elif field.name == "raster":
+            a, b = (np.array([*t.classes, ""])[r] for t, r in ((ours, a), (theirs, b)))
+        elif field.name in ("classes", "targets", "distance"):
+            continue
+        np.testing.assert_array_equal(a, b, err_msg=field.name)
+    for target in theirs.targets:
+        a, b = (t.distance[:, t.targets.index(target)] for t in (ours, theirs))
+        np.testing.assert_array_equal(a, b)
+
+
+def test_out_and_in_is_the_identity(some_rooms: SceneTables, tmp_path: Path) -> None:
+    exporter.write_folder(some_rooms, tmp_path / "out", silent)
+    back = importer.read_folder(tmp_path / "out", silent).tables
+    assert_equal(some_rooms, back)
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(some_rooms.scenes)
+    assert not list((tmp_path / "cache").glob("import-*")), "the parts of an import are removed"
+
+
+def detections(t: SceneTables, exact: bool) -> tuple[Counter, set]:
+    """Class and box of every row with a box, and what is visible from where."""
+    boxes = [tuple(box) for box in t.row_box.tolist()]
+    kinds = [t.classes[c] for c in t.row_class]
+    states = t.row_state.tolist()
+    seen = {
+        (states[i], t.object_id[t.row_object[i]] if exact else kinds[i])
+        for i in np.flatnonzero(t.row_visible)
+    }
+    return Counter(zip(states, kinds, boxes, strict=True)), seen
+
+
+def test_the_layout_alone_holds_transitions_visibility_and_boxes(
+    some_rooms: SceneTables, tmp_path: Path
+) -> None:
+    """Without our own file, whose a box is may be lost, but nothing else is."""
+    room = some_rooms.subset(["FloorPlan303"])
+    exporter.write_folder(room, tmp_path / "out", silent)
+    (tmp_path / "out" / "FloorPlan303" / OBJECT_FILE).unlink()
+    back = importer.read_folder(tmp_path / "out", silent).tables
+    np.testing.assert_array_equal(back.next_position, room.next_position)
+    np.testing.assert_array_equal(back.position, room.position)
+    assert detections(back, exact=True) == detections(room, exact=True)
+    shared = [t for t in back.targets if t in room.targets]
+    for target in shared:
+        a, b = (t.distance[:, t.targets.index(target)] for t in (room, back))
+        np.testing.assert_array_equal(a, b)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=8)
+def test_random_rooms(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    room = tables.build([toy.random_room(draw, name="FloorPlan5")])
+    room = dataclasses.replace(room, room_type=np.zeros(1, np.int8))
+    folder = tmp_path_factory.mktemp("random") / "FloorPlan5"
+    folder.mkdir()
+    exporter.write_scene(room, folder)
+    data = reader.read_scene(folder, "FloorPlan5", 0)
+    assert_equal(room, importer.make_tables(folder, [data]))
+    (folder / OBJECT_FILE).unlink()
+    data = reader.read_scene(folder, "FloorPlan5", 0)
+    back = importer.make_tables(folder, [data])
+    assert detections(back, exact=False) == detections(room, exact=False)
+
+
+def test_imported_rooms_go_out_and_in_again(tmp_path: Path) -> None:
+    """Nameless objects and those without a box or a place included."""
+    from tests import original
+
+    first = importer.read_folder(original.write_all(tmp_path / "original"), silent).tables
+    exporter.write_folder(first, tmp_path / "out", silent)
+    again = importer.read_folder(tmp_path / "out", silent).tables
+    assert_equal(first, again)
+    keys = (tmp_path / "out" / "FloorPlan1" / "graph.json").read_text()
+    assert '"-0.00|0.25|0|0"' in keys
+
+
+def test_the_graph_is_the_reference_controllers(some_rooms: SceneTables) -> None:
+    """Walked as the reference walks: the key of the guessed state must be a neighbour's."""
+    room = some_rooms.subset(["FloorPlan229"])
+    keys = state_keys(room.position)
+    graph = exporter.graph(room, keys)
+    neighbours: dict[str, set[str]] = {node["id"]: set() for node in graph["nodes"]}
+    for link in graph["links"]:
+        neighbours[link["source"]].add(link["target"])
+    ways = [(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)]
+    for i, key in enumerate(keys):
+        x, z, rotation, horizon = key.split("|")
+        across, along = ways[int(rotation) // 45]
+        guess = f"{float(x) + across * 0.25:0.2f}|{float(z) + along * 0.25:0.2f}"
+        guess = guess.replace("-0.00", "0.00")
+        moved = room.next_position[i // 16, int(rotation) // 45] != i // 16
+        assert (f"{guess}|{rotation}|{horizon}" in neighbours[key]) == moved
+        assert f"{x}|{z}|{(int(rotation) + 45) % 360}|{horizon}" in neighbours[key]
+        assert f"{x}|{z}|{rotation}|{30 - int(horizon)}" in neighbours[key]
+        assert len(neighbours[key]) == 3 + moved
+
+
+def test_what_older_code_reads(some_rooms: SceneTables, tmp_path: Path) -> None:
+    pytest.importorskip("h5py")
+    room = some_rooms.subset(["FloorPlan428"])
+    glove = words.load_bundled()
+    vectors = glove.table(room.classes, None)
+    parents = {"bathroom": {"Mirror": {"Sink": 0.5}}}
+    out = tmp_path / "out"
+    exporter.write_folder(room, out, silent, parents, vectors, features=True)
+    assert json.loads((out / "c2p_prob.json").read_text()) == {
+        "Bathroom": {"Mirror": {"Sink": 0.5}}
+    }
+    seen = json.loads((out / "FloorPlan428" / "visible_object_map.json").read_text())
+    assert seen == json.loads((out / "FloorPlan428" / "visible_object_map_1.5.json").read_text())
+    assert all(seen.values()), "objects that are visible from nowhere are not listed"
+    with hdf5.opened(out / "FloorPlan428" / "resnet18_featuremap.hdf5") as file:
+        keys = state_keys(room.position)
+        assert sorted(file.names()) == sorted(keys)
+        for state in range(0, room.num_states, 97):
+            values = file.read(keys[state], (512, 7, 7))
+            shown = np.where(values.any(axis=0), values.argmax(axis=0), -1)
+            np.testing.assert_array_equal(shown, room.raster[state])
+            assert set(np.unique(values)) <= {0.0, 1.0}
+    stored = words.load(out / "thor_glove" / "glove_map50d.hdf5")
+    np.testing.assert_allclose(stored.table(room.classes), glove.table(room.classes), atol=1e-6)
+
+    features = tmp_path / "a.features.npy"
+    importer.write_features(out, room, features, silent)
+    loaded = importer.load_features(tmp_path / "a.npz", room)
+    assert loaded.shape == (room.num_states, 512, 7, 7)
+    assert loaded.dtype == np.float16
+    np.testing.assert_array_equal(np.where(loaded[5].any(0), loaded[5].argmax(0), -1),
+                                  room.raster[5])  # fmt: skip
+    with pytest.raises(FileError, match="the maps of other rooms"):
+        importer.load_features(tmp_path / "a.npz", some_rooms)
+    with pytest.raises(FileError, match=r"b\.features\.npy: no such file"):
+        importer.load_features(tmp_path / "b.npz", room)
+
+
+def test_broken_features_leave_nothing_behind(some_rooms: SceneTables, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    room = some_rooms.subset(["FloorPlan428"])
+    exporter.write_folder(room, tmp_path / "out", silent)
+    features = tmp_path / "a.features.npy"
+    with pytest.raises(FileError, match=r"featuremap\.hdf5: no such file"):
+        importer.write_features(tmp_path / "out", room, features, silent)
+    for name, data, reason in (
+        (state_keys(room.position)[0], np.full((512, 7, 7), np.nan), "NaN"),
+        (state_keys(room.position)[0], np.full((512, 7, 7), 1e6), "half precision"),
+        (state_keys(room.position)[0], np.zeros((512, 7)), "shape"),
+        ("9.00|9.00|0|0", np.zeros((512, 7, 7)), "not on the grid"),
+    ):
+        with h5py.File(tmp_path / "out/FloorPlan428/resnet18_featuremap.hdf5", "w") as file:
+            file[name] = data
+        with pytest.raises(FileError, match=rf"featuremap\.hdf5: .*{reason}"):
+            importer.write_features(tmp_path / "out", room, features, silent)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out"]
+
+
+def test_parents_go_out_and_in(ithor: SceneTables) -> None:
+    split = make_split("22/0")
+    train = ithor.subset(split.train_scenes)
+    ours, theirs = find_parents(train, TARGETS), named_parents(ithor)
+    back = published_parents(train, TARGETS, theirs, ())
+    np.testing.assert_array_equal(np.sort(ours.reward), np.sort(back.reward))
+    for goal in range(len(ithor.targets)):
+        assert set(ours.classes[goal]) == set(back.classes[goal])
+
+
+def test_a_stopped_import_goes_on(
+    some_rooms: SceneTables, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rooms = some_rooms.subset(["FloorPlan303", "FloorPlan402", "FloorPlan428"])
+    out = tmp_path / "out"
+    exporter.write_folder(rooms, out, silent)
+    read: list[str] = []
+    plain = reader.read_scene
+
+    def counted(folder: Path, name: str, room_type: int) -> reader.SceneData:
+        read.append(name)
+        if len(read) == 2:
+            raise KeyboardInterrupt
+        return plain(folder, name, room_type)
+
+    monkeypatch.setattr(importer, "read_scene", counted)
+    with pytest.raises(KeyboardInterrupt):
+        importer.read_folder(out, silent)
+    back = importer.read_folder(out, silent).tables
+    assert read == ["FloorPlan303", "FloorPlan402", "FloorPlan402", "FloorPlan428"]
+    assert_equal(rooms, back)
+
+    # A file that changed since is read anew, and so is a part that is damaged.
+    read[:] = ["", ""]
+    parts = importer._parts_folder(out)
+    importer._read_or_recall(parts, out / "FloorPlan303", "FloorPlan303", 2)
+    importer._read_or_recall(parts, out / "FloorPlan303", "FloorPlan303", 2)
+    (out / "FloorPlan303" / "grid.json").touch()
+    importer._read_or_recall(parts, out / "FloorPlan303", "FloorPlan303", 2)
+    (parts / "FloorPlan303.npz").write_bytes(b"damaged")
+    importer._read_or_recall(parts, out / "FloorPlan303", "FloorPlan303", 2)
+    assert read == ["", "", *["FloorPlan303"] * 3]
+
+
+def test_folders_that_hold_no_scenes(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="no folders FloorPlan1 to FloorPlan430"):
+        importer.find_root(tmp_path / "nowhere")
+    (tmp_path / "FloorPlan501").mkdir()
+    with pytest.raises(FileError, match="no folders FloorPlan1 to FloorPlan430"):
+        importer.find_root(tmp_path)
+    (tmp_path / "FloorPlan1").mkdir()
+    (tmp_path / "FloorPlan1_physics").mkdir()
+    with pytest.raises(FileError, match="FloorPlan1 is there twice"):
+        importer.find_scenes(importer.find_root(tmp_path))
+
+
+@pytest.mark.slow
+def test_all_rooms_out_and_in_are_the_bundled_tables(ithor: SceneTables, tmp_path: Path) -> None:
+    """To the last bit: the hash over all fields is the same."""
+    exporter.write_folder(ithor, tmp_path / "out", silent)
+    back = importer.read_folder(tmp_path / "out", silent).tables
+    assert back.data_version == ithor.data_version
