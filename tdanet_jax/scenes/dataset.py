@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tdanet_jax import files
 from tdanet_jax.scenes import archive, cache
 from tdanet_jax.scenes.scene import Scene, SceneObject
 from tdanet_jax.scenes.tables import Progress, SceneTables
@@ -94,12 +94,8 @@ def save(rooms: Rooms, path: Path) -> None:
     arrays = rooms.tables.to_arrays()
     arrays["extras/notes"] = np.frombuffer(json.dumps(notes).encode(), np.uint8)
     arrays["extras/adjacency"] = extras.adjacency
-    fresh = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with files.replacing(path) as fresh:
         archive.write(fresh, arrays, compress=True)
-        os.replace(fresh, path)
-    finally:
-        fresh.unlink(missing_ok=True)
 
 
 def load(path: Path) -> Rooms:

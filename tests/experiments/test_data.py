@@ -17,7 +17,7 @@ from tdanet_jax.agent import Detection
 from tdanet_jax.scenes import SceneTables, dataset
 from tests import original
 from tests.conftest import SOME_ROOMS
-from tests.experiments.test_train_zero_shot import TINY
+from tests.experiments.command import TINY
 
 
 @pytest.fixture(autouse=True)

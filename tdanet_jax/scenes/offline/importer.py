@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tdanet_jax import files
 from tdanet_jax.scenes import archive, cache
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.offline.extras import read_extras
@@ -147,9 +147,8 @@ def _read_or_recall(parts: Path, place: Path, name: str, room_type: int) -> Scen
     data = read_scene(place, name, room_type)
     with contextlib.suppress(OSError):  # without a cache an import starts anew
         parts.mkdir(parents=True, exist_ok=True)
-        fresh = part.with_name(f".{part.name}.{os.getpid()}")
-        archive.write(fresh, _pack(data, stamp))
-        os.replace(fresh, part)
+        with files.replacing(part) as fresh:
+            archive.write(fresh, _pack(data, stamp))
     return data
 
 
@@ -206,8 +205,7 @@ def write_features(folder: Path, tables: SceneTables, out: Path, report: Report)
     """
     root = find_root(folder)
     places = {name: place for name, _, place in find_scenes(root)}
-    fresh = out.with_name(f".{out.name}.{os.getpid()}")
-    try:
+    with files.replacing(out) as fresh:
         features = np.lib.format.open_memmap(
             fresh, "w+", np.float16, (tables.num_states, *FEATURE_SHAPE)
         )
@@ -220,9 +218,6 @@ def write_features(folder: Path, tables: SceneTables, out: Path, report: Report)
             note = f"; {rest} states without one are zero" if rest else ""
             report((i + 1) / len(tables.scenes), f"{name}: {count} feature maps{note}")
         features.flush()
-        os.replace(fresh, out)
-    finally:
-        fresh.unlink(missing_ok=True)
 
 
 def _copy_features(path: Path, grid: Grid, features: np.ndarray, first: int) -> int:
