@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -129,10 +126,3 @@ def test_wrong_arguments_give_one_line_and_write_nothing(
         assert reason in fails(command, arguments, capsys)
         found = [p for p in tmp_path.rglob("*") if "parts" not in str(p)]
         assert sorted(found) == before
-
-
-def test_help_is_quick_and_names_both_sources() -> None:
-    """The commands import nothing heavy before they know what to do."""
-    code = "import sys; from experiments import scenes, evaluate; assert 'jax' not in sys.modules"
-    environment = os.environ | {"PYTHONPATH": os.getcwd()}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment)

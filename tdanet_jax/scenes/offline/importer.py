@@ -153,8 +153,8 @@ def _read_or_recall(parts: Path, place: Path, name: str, room_type: int) -> Scen
 
 
 def _stamp(place: Path) -> list[list[Any]]:
-    files = [place / name for name in SOURCES]
-    return [[f.name, f.stat().st_size, f.stat().st_mtime_ns] for f in files if f.is_file()]
+    found = [place / name for name in SOURCES if (place / name).is_file()]
+    return [[f.name, f.stat().st_size, f.stat().st_mtime_ns] for f in found]
 
 
 def _pack(data: SceneData, stamp: list) -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tdanet_jax import episodes, zero_shot
-from tdanet_jax.config import TrainConfig
+from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.offline import extras, importer
 from tdanet_jax.task import make_task
@@ -51,6 +51,13 @@ def test_a_task_takes_published_parents_and_episodes(rooms: Rooms, glove: WordVe
     assert lists["seen"].pose.tolist() == [48 + 2, 48 + 32 + 8]
     assert set(lists["seen"].target) == {mug}
     assert task.classes.edges
+    # The table that is visible without a box is no detection: five of six rows a room.
+    assert task.tables.row_start[-1] == 12
+    assert task.eval_params.row_start[-1] == 10
+    merged = TrainConfig(network=NetworkConfig(rows="class"))
+    params = make_task(merged, rooms.tables, glove, rooms.extras).eval_params
+    assert params.row_start[-1] == 8  # the two mugs of a view are one
+    assert params.row_start[[48 + 32, 48 + 33]].tolist() == [6, 8]
 
 
 def test_without_published_episodes_they_are_drawn(rooms: Rooms, glove: WordVectors) -> None:
