@@ -225,7 +225,8 @@ def _copy_features(path: Path, grid: Grid, features: np.ndarray, first: int) -> 
     with hdf5.opened(path) as reader:
         for key in reader.names():
             state = grid.state(path, key)
-            values = reader.read(key, FEATURE_SHAPE).astype(np.float16)
+            with np.errstate(over="ignore"):  # what is beyond is infinite, and refused
+                values = reader.read(key, FEATURE_SHAPE).astype(np.float16)
             if not np.isfinite(values).all():
                 raise FileError(path, f"{key} holds numbers beyond half precision")
             features[first + state] = values

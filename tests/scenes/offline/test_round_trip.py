@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections import Counter
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from tdanet_jax.scenes.offline import exporter, importer, reader
 from tdanet_jax.scenes.offline.layout import OBJECT_FILE, state_keys
 from tdanet_jax.untrusted import FileError, hdf5
 from tdanet_jax.vocabulary import TARGETS, make_split
+from tests import original
 
 
 def silent(share: float, line: str) -> None:
@@ -48,10 +50,11 @@ def assert_equal(ours: SceneTables, theirs: SceneTables) -> None:
 
 
 def test_out_and_in_is_the_identity(some_rooms: SceneTables, tmp_path: Path) -> None:
-    exporter.write_folder(some_rooms, tmp_path / "out", silent)
+    rooms = some_rooms.subset(["FloorPlan29", "FloorPlan321", "FloorPlan428"])
+    exporter.write_folder(rooms, tmp_path / "out", silent)
     back = importer.read_folder(tmp_path / "out", silent).tables
-    assert_equal(some_rooms, back)
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(some_rooms.scenes)
+    assert_equal(rooms, back)
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(rooms.scenes)
     assert not list((tmp_path / "cache").glob("import-*")), "the parts of an import are removed"
 
 
@@ -103,8 +106,6 @@ def test_random_rooms(tmp_path_factory: pytest.TempPathFactory, seed: int) -> No
 
 def test_imported_rooms_go_out_and_in_again(tmp_path: Path) -> None:
     """Nameless objects and those without a box or a place included."""
-    from tests import original
-
     first = importer.read_folder(original.write_all(tmp_path / "original"), silent).tables
     exporter.write_folder(first, tmp_path / "out", silent)
     again = importer.read_folder(tmp_path / "out", silent).tables
@@ -202,12 +203,9 @@ def test_parents_go_out_and_in(ithor: SceneTables) -> None:
         assert set(ours.classes[goal]) == set(back.classes[goal])
 
 
-def test_a_stopped_import_goes_on(
-    some_rooms: SceneTables, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rooms = some_rooms.subset(["FloorPlan303", "FloorPlan402", "FloorPlan428"])
-    out = tmp_path / "out"
-    exporter.write_folder(rooms, out, silent)
+def test_a_stopped_import_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = original.write_all(tmp_path / "original")
+    whole = importer.read_folder(source, silent).tables
     read: list[str] = []
     plain = reader.read_scene
 
@@ -219,21 +217,32 @@ def test_a_stopped_import_goes_on(
 
     monkeypatch.setattr(importer, "read_scene", counted)
     with pytest.raises(KeyboardInterrupt):
-        importer.read_folder(out, silent)
-    back = importer.read_folder(out, silent).tables
-    assert read == ["FloorPlan303", "FloorPlan402", "FloorPlan402", "FloorPlan428"]
-    assert_equal(rooms, back)
+        importer.read_folder(source, silent)
+    back = importer.read_folder(source, silent).tables
+    assert read == ["FloorPlan1", "FloorPlan21", "FloorPlan21"]
+    assert_equal(whole, back)
 
-    # A file that changed since is read anew, and so is a part that is damaged.
-    read[:] = ["", ""]
-    parts = importer._parts_folder(out)
-    importer._read_or_recall(parts, out / "FloorPlan303", "FloorPlan303", 2)
-    importer._read_or_recall(parts, out / "FloorPlan303", "FloorPlan303", 2)
-    (out / "FloorPlan303" / "grid.json").touch()
-    importer._read_or_recall(parts, out / "FloorPlan303", "FloorPlan303", 2)
-    (parts / "FloorPlan303.npz").write_bytes(b"damaged")
-    importer._read_or_recall(parts, out / "FloorPlan303", "FloorPlan303", 2)
-    assert read == ["", "", *["FloorPlan303"] * 3]
+
+def test_scenes_that_changed_since_are_read_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = original.write_all(tmp_path / "original") / "FloorPlan1"
+    parts = tmp_path / "parts"
+    read: list[str] = []
+    plain = reader.read_scene
+    monkeypatch.setattr(
+        importer, "read_scene", lambda *given: (read.append(given[1]), plain(*given))[1]
+    )
+    for times, change in (
+        (1, lambda: None),
+        (1, lambda: None),
+        (2, lambda: os.utime(place / "grid.json", (1, 1))),
+        (3, lambda: (parts / "FloorPlan1.npz").write_bytes(b"damaged")),
+    ):
+        change()
+        data = importer._read_or_recall(parts, place, "FloorPlan1", 0)
+        assert len(read) == times
+        assert len(data.sight.state) == 6
 
 
 def test_folders_that_hold_no_scenes(tmp_path: Path) -> None:
