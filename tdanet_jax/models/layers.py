@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,6 +18,9 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 TAPE = "tape"
+
+#: What torch.nn.Linear draws its weights from: uniform in plus or minus fan_in^-1/2.
+TORCH_UNIFORM = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 
 #: A recurrent state: hidden and cell, each [B, H] float32.
 Carry = tuple[jax.Array, jax.Array]
@@ -133,6 +137,18 @@ def _recall_product_bwd(dtype: Any, saved: tuple, cotangent: jax.Array) -> tuple
 
 
 recall_product.defvjp(_recall_product_fwd, _recall_product_bwd)
+
+
+def recorded(module: nn.Module, name: str, compute: Callable[[], Any]) -> Any:
+    """What `compute` gives, recorded on the tape while acting and taken from there afterwards.
+
+    What is taken from the tape is data: its gradient is the business of whoever reads it.
+    """
+    if module.is_mutable_collection(TAPE):
+        value = compute()
+        module.put_variable(TAPE, name, value)
+        return value
+    return module.get_variable(TAPE, name) if module.has_variable(TAPE, name) else compute()
 
 
 class Linear(nn.Module):
