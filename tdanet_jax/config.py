@@ -54,6 +54,10 @@ class LearnerConfig:
     """Weight of the squared error of the values."""
     step_limit: int = 50
     """Actions after which a training episode is truncated."""
+    partial_reward: Literal["parents", "similarity", "none"] = "parents"
+    """What earns something before the target is found. parents: the sight of a parent of the target
+    (Eq. 3). similarity: 0.1 times the cosine between the word vectors of the target and of a class
+    in view, when it is the largest of the episode so far (SSNet). none: nothing."""
     bootstrap_truncated: bool = True
     """Values the state in which a time-out cut an episode; False takes it for an end, as the
     reference does."""

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from tdanet_jax.reward import DONE_REWARD, STEP_REWARD, Parents
+from tdanet_jax.reward import DONE_REWARD, SIMILARITY_SHARE, STEP_REWARD, Parents
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ROOM_TYPES, Action
 
@@ -50,6 +50,7 @@ class EnvParams(struct.PyTreeNode):
     pair_target: jax.Array  # [Q] int32, the target of a pair
     pair_starts: jax.Array  # [Q, 2] int32, first and number of a pair's start positions
     start_position: jax.Array  # [sum] int32, positions from which the pair's target can be reached
+    similarity: jax.Array | None  # [S, G] float32, largest cosine in view, if it is paid for
     raster: jax.Array | None  # [S, 7, 7] int8, class of each image cell, -1 none; if anyone looks
     max_detections: int = struct.field(pytree_node=False)  # K, most detections in any pose
 
@@ -62,6 +63,7 @@ class EnvState(struct.PyTreeNode):
     steps: jax.Array  # int32, actions taken
     parents_seen: jax.Array  # int32, bit set over the target's three parents
     shortest: jax.Array  # int32, L: actions on the optimal path from the start, Done included
+    similarity: jax.Array | None = None  # float32, largest cosine so far, if it is paid for
 
 
 class Observation(struct.PyTreeNode):
@@ -92,6 +94,7 @@ def make_params(
     step_limits: Sequence[int],
     merge: bool,
     image: bool = False,
+    similarity: np.ndarray | None = None,
 ) -> EnvParams:
     """Puts scene tables into the arrays that the environment reads.
 
@@ -102,6 +105,8 @@ def make_params(
       step_limits: actions after which an episode is truncated, by room type.
       merge: one detection per class and pose (extent over its instances) instead of one per object.
       image: observations hold the class raster, too.
+      similarity: [S, G], largest cosine between the target and a class in view; given, it is paid
+        for in place of parents.
 
     Raises:
       ValueError: no episode is possible.
@@ -123,6 +128,7 @@ def make_params(
         parent_reward=jnp.asarray(parents.reward, jnp.float32),
         step_limit=jnp.asarray(step_limits, jnp.int32),
         max_detections=longest,
+        similarity=None if similarity is None else jnp.asarray(similarity, jnp.float32),
         raster=jnp.asarray(tables.raster, jnp.int8) if image else None,
         **{name: jnp.asarray(v, jnp.int32) for name, v in _episode_pool(tables, targets).items()},
     )
@@ -211,7 +217,14 @@ def start(params: EnvParams, pose: jax.Array, target: jax.Array) -> EnvState:
     """The state at the start of the given episode."""
     zero = jnp.zeros_like(pose)
     shortest = params.distance[pose, target].astype(jnp.int32) + 1
-    return EnvState(pose=pose, target=target, steps=zero, parents_seen=zero, shortest=shortest)
+    return EnvState(
+        pose=pose,
+        target=target,
+        steps=zero,
+        parents_seen=zero,
+        shortest=shortest,
+        similarity=None if params.similarity is None else jnp.zeros_like(pose, jnp.float32),
+    )
 
 
 def reset_state(key: jax.Array, params: EnvParams) -> EnvState:
@@ -271,36 +284,57 @@ def move(params: EnvParams, pose: jax.Array, action: jax.Array) -> jax.Array:
 
 
 def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome:
-    """One action, without any reset. The reward is one of Eq. 3's four values.
+    """One action, without any reset. The reward is one of four values, as in the paper's Eq. 3.
 
-    -0.01 by default; R_p instead when a parent of the target is visible for the first time (the
-    largest such; once per parent class); R_t, or R_t + R_p with a parent in view, for a `Done`
-    with the target visible.
+    -0.01 by default; a partial reward instead where `_partial_reward` gives one; R_t, or R_t and
+    the partial reward for what is in view, for a `Done` with the target visible.
     """
     pose = move(params, state.pose, action)
     done = action == Action.DONE
-    parent_classes = params.parent_class[state.target]
-    parent_rewards = params.parent_reward[state.target]
-    in_view = is_visible(params, pose, parent_classes)
-    bits = jnp.left_shift(1, jnp.arange(parent_classes.shape[0], dtype=jnp.int32))
-    fresh = in_view & ((state.parents_seen & bits) == 0)
     success = done & is_visible(params, pose, params.target_class[state.target])
-
-    def largest(among: jax.Array) -> jax.Array:
-        return jnp.max(jnp.where(among, parent_rewards, 0.0), axis=-1)
-
-    reward = jnp.where(~done & jnp.any(fresh), largest(fresh), STEP_REWARD)
-    reward = jnp.where(success, DONE_REWARD + largest(in_view), reward)
-    seen = state.parents_seen | jnp.sum(jnp.where(in_view, bits, 0), axis=-1, dtype=jnp.int32)
+    earns, partial, at_done, seen = _partial_reward(state, pose, params)
+    reward = jnp.where(~done & earns, partial, STEP_REWARD)
+    reward = jnp.where(success, DONE_REWARD + at_done, reward)
     steps = state.steps + 1
     limit = params.step_limit[params.position_room[pose >> 4].astype(jnp.int32)]
     return Outcome(
-        state=state.replace(pose=pose, steps=steps, parents_seen=seen),
+        state=seen.replace(pose=pose, steps=steps),
         reward=reward.astype(jnp.float32),
         terminated=done,
         truncated=~done & (steps >= limit),
         success=success,
     )
+
+
+def _partial_reward(
+    state: EnvState, pose: jax.Array, params: EnvParams
+) -> tuple[jax.Array, jax.Array, jax.Array, EnvState]:
+    """What the view from `pose` is worth.
+
+    With parents: R_p when a parent of the target is visible for the first time (the largest such;
+    once per parent class). With similarities: 0.1 times the largest cosine between the target and a
+    class in view when it is the largest of the episode so far (Zhao et al. 2023).
+
+    Returns:
+      Whether it earns anything, how much, what the same view adds to a success whatever was seen
+      before, and the state that remembers it.
+    """
+    if params.similarity is not None and state.similarity is not None:
+        now = params.similarity[pose, state.target]
+        worth = SIMILARITY_SHARE * now
+        best = jnp.maximum(now, state.similarity)
+        rises = now > state.similarity
+        return rises, worth, jnp.maximum(worth, 0.0), state.replace(similarity=best)
+    rewards = params.parent_reward[state.target]
+    in_view = is_visible(params, pose, params.parent_class[state.target])
+    bits = jnp.left_shift(1, jnp.arange(rewards.shape[0], dtype=jnp.int32))
+    fresh = in_view & ((state.parents_seen & bits) == 0)
+
+    def largest(among: jax.Array) -> jax.Array:
+        return jnp.max(jnp.where(among, rewards, 0.0), axis=-1)
+
+    seen = state.parents_seen | jnp.sum(jnp.where(in_view, bits, 0), axis=-1, dtype=jnp.int32)
+    return jnp.any(fresh), largest(fresh), largest(in_view), state.replace(parents_seen=seen)
 
 
 def step(

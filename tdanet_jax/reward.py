@@ -3,6 +3,9 @@
 R_p = R_t * Pr(t | p) * 0.1 (the paper's Eq. 3 and its text). Pr(t | p) is estimated in the training
 rooms of the target's type: over rooms that hold both classes, the share in which the nearest
 instances are within 1.5 m of each other.
+
+SSNet (Zhao et al. 2023) pays for likeness instead: 0.1 times the cosine between the word vectors of
+the target and of a class in view, whenever it is the largest of the episode so far.
 """
 
 from __future__ import annotations
@@ -22,6 +25,8 @@ DONE_REWARD = 5.0
 #: R_p = R_t * Pr(t | p) * PARENT_SHARE.
 PARENT_SHARE = 0.1
 PARENTS_PER_TARGET = 3
+#: What a cosine of 1 is worth where likeness is paid for.
+SIMILARITY_SHARE = 0.1
 #: Nearest instances at most this far apart (metres, centre to centre) count as together.
 NEAR = 1.5
 #: A parent stands in at least this share of the rooms that hold the target: one room proves little.
@@ -46,6 +51,37 @@ class Parents:
 
     classes: np.ndarray
     reward: np.ndarray
+
+
+def no_parents(tables: SceneTables) -> Parents:
+    """Parents of nothing: no partial reward."""
+    shape = len(tables.targets), PARENTS_PER_TARGET
+    return Parents(np.full(shape, -1, np.int32), np.zeros(shape, np.float32))
+
+
+def cosines(words: np.ndarray) -> np.ndarray:
+    """Cosines between all word vectors [C, D]: [C, C] float32, 0 where a vector is zero."""
+    length = np.linalg.norm(words, axis=1, keepdims=True)
+    unit = words / np.where(length > 0, length, 1.0)
+    return np.clip(unit @ unit.T, -1.0, 1.0).astype(np.float32)
+
+
+def greatest_similarity(tables: SceneTables, cosine: np.ndarray) -> np.ndarray:
+    """The largest cosine between each target and a class in view: [S, G] float32, 0 in an empty
+    frame.
+
+    Args:
+      tables: training rooms, without the classes that training must not know.
+      cosine: [C, C], from `cosines`.
+    """
+    found = np.zeros((tables.num_states, len(tables.targets)), np.float32)
+    filled = np.flatnonzero(np.diff(tables.row_start))
+    boxed = tables.row_box[:, 0] >= 0  # what is visible without a known box is no detection
+    if filled.size:
+        for goal, target in enumerate(tables.targets):
+            of_row = cosine[tables.classes.index(target)][tables.row_class] * boxed
+            found[filled, goal] = np.maximum.reduceat(of_row, tables.row_start[filled])
+    return found
 
 
 def find_parents(tables: SceneTables, targets: Mapping[str, Sequence[str]]) -> Parents:

@@ -15,7 +15,14 @@ from tdanet_jax.classes import Classes, make_classes
 from tdanet_jax.config import MODELS, NetworkConfig, TrainConfig
 from tdanet_jax.env import TEST_STEP_LIMITS, EnvParams
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.reward import Parents, find_parents, published_parents
+from tdanet_jax.reward import (
+    Parents,
+    cosines,
+    find_parents,
+    greatest_similarity,
+    no_parents,
+    published_parents,
+)
 from tdanet_jax.scenes.dataset import Extras, load_rooms
 from tdanet_jax.scenes.tables import Progress, SceneTables
 from tdanet_jax.vocabulary import ROOM_TYPES, Split, make_split
@@ -92,17 +99,26 @@ def make_task(
     model = make_model(config, classes)
     shown = (model.encoder.ROWS or config.network.rows) == "class", model.encoder.IMAGE
     parents = _parents(seen_rooms, split, extras)
+    paid = config.learner.partial_reward
     limits = [config.learner.step_limit] * len(ROOM_TYPES)
     words = vectors.table(tables.classes, config.network.word_norm)
+    train_words = zero_shot.hide_words(words, tables.classes, split.hidden)
     targets = {room: split.seen[room] + split.unseen[room] for room in ROOM_TYPES}
     return Task(
         tables=tables,
         split=split,
         classes=classes,
         model=model,
-        train_params=env.make_params(seen_rooms, split.seen, parents, limits, *shown),
+        train_params=env.make_params(
+            seen_rooms,
+            split.seen,
+            parents if paid == "parents" else no_parents(seen_rooms),
+            limits,
+            *shown,
+            greatest_similarity(seen_rooms, cosines(train_words)) if paid == "similarity" else None,
+        ),
         eval_params=env.make_params(tables, targets, parents, TEST_STEP_LIMITS, *shown),
-        train_words=jnp.asarray(zero_shot.hide_words(words, tables.classes, split.hidden)),
+        train_words=jnp.asarray(train_words),
         words=jnp.asarray(words),
         extras=extras,
     )

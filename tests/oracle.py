@@ -52,6 +52,7 @@ class Episode:
     target: str
     steps: int = 0
     parents_seen: set[str] = dataclasses.field(default_factory=set)
+    most_similar: float = 0.0
 
 
 class Outcome(NamedTuple):
@@ -82,6 +83,7 @@ class World:
         parents: ParentRewards,
         step_limits: Sequence[int],
         ahead: Callable[[int, int], int] | None = None,
+        similarity: Mapping[str, Mapping[str, float]] | None = None,
     ) -> None:
         """Args:
         tables: the rooms.
@@ -89,11 +91,13 @@ class World:
         step_limits: actions in an episode, by room type.
         ahead: (position, heading in degrees) -> position one step on; by default the tables'
           own. `walk_on_grid` derives it from the coordinates instead.
+        similarity: target -> class -> cosine; given, it is paid for in place of parents.
         """
         self.tables = tables
         self.parents = parents
         self.step_limits = step_limits
         self.ahead = ahead or self.ahead_in_table
+        self.similarity = similarity
 
     def ahead_in_table(self, position: int, heading: int) -> int:
         """The point that the tables name as next."""
@@ -156,22 +160,34 @@ class World:
         """One action of an episode: Eq. 3's reward and how it ends, if it does."""
         episode.pose = self.moved(episode.pose, action)
         episode.steps += 1
+        limit = self.step_limits[ROOMS.index(self.room(episode.pose.position))]
+        timed_out = action != DONE and episode.steps >= limit
+        success = action == DONE and episode.target in self.visible(state_of(episode.pose))
+        partial = self.seen_parents if self.similarity is None else self.seen_likeness
+        new, anyway = partial(episode)
+        if action == DONE:
+            return Outcome(5.0 + anyway if success else -0.01, True, False, success)
+        return Outcome(-0.01 if new is None else new, False, timed_out, False)
+
+    def seen_parents(self, episode: Episode) -> tuple[float | None, float]:
+        """R_p of the parents that are visible for the first time, and of all that are visible."""
         visible = self.visible(state_of(episode.pose))
         worth = self.parents.get(episode.target, {})
         in_view = {name for name in worth if name in visible}
         new = in_view - episode.parents_seen
         episode.parents_seen |= in_view
-        if action == DONE:
-            success = episode.target in visible
-            reward = -0.01
-            if success:
-                reward = 5.0
-                if in_view:
-                    reward += max(worth[name] for name in in_view)
-            return Outcome(reward, True, False, success)
-        reward = max(worth[name] for name in new) if new else -0.01
-        limit = self.step_limits[ROOMS.index(self.room(episode.pose.position))]
-        return Outcome(reward, False, episode.steps >= limit, False)
+        newest = max(worth[name] for name in new) if new else None
+        return newest, max((worth[name] for name in in_view), default=0.0)
+
+    def seen_likeness(self, episode: Episode) -> tuple[float | None, float]:
+        """0.1 times the largest cosine in view: if it has risen, and in any case."""
+        assert self.similarity is not None
+        cosines = self.similarity[episode.target]
+        rows = self.rows(state_of(episode.pose))
+        greatest = max((cosines[self.class_of(row)] for row in rows), default=0.0)
+        risen = greatest > episode.most_similar
+        episode.most_similar = max(greatest, episode.most_similar)
+        return (0.1 * greatest if risen else None), max(0.1 * greatest, 0.0)
 
     @cache  # noqa: B019 - worlds live as long as a test
     def distances(self, scene: int, target: str) -> dict[int, int]:

@@ -17,7 +17,7 @@ from scipy import stats
 
 from tdanet_jax import env
 from tdanet_jax.env import EnvParams, EnvState, Observation
-from tdanet_jax.reward import Parents
+from tdanet_jax.reward import Parents, cosines, greatest_similarity, no_parents
 from tdanet_jax.scenes import SceneTables, toy
 from tdanet_jax.scenes.tables import build
 from tdanet_jax.vocabulary import TARGETS
@@ -185,6 +185,42 @@ def test_agrees_with_the_slow_world_in_rooms_built_from_boxes() -> None:
     assert assert_worlds_agree(world, params, batch=20, steps=40, seed=3) > 20
 
 
+def random_likeness(
+    tables: SceneTables, seed: int
+) -> tuple[np.ndarray, dict[str, dict[str, float]]]:
+    """Cosines of all sizes between targets and classes, in both worlds' terms."""
+    words = np.random.default_rng(seed).normal(size=(len(tables.classes), 3))
+    cosine = cosines(words.astype(np.float32))
+    named = {
+        target: dict(
+            zip(tables.classes, map(float, cosine[tables.classes.index(target)]), strict=True)
+        )
+        for target in tables.targets
+    }
+    return greatest_similarity(tables, cosine), named
+
+
+def test_rewards_for_likeness_agree_with_the_slow_world(some_rooms: SceneTables) -> None:
+    similarity, named = random_likeness(some_rooms, seed=5)
+    world = World(some_rooms, {}, STEP_LIMITS, similarity=named)
+    params = env.make_params(
+        some_rooms, TARGETS, no_parents(some_rooms), STEP_LIMITS, False, similarity=similarity
+    )
+    assert assert_worlds_agree(world, params, batch=25, steps=30, seed=6) > 20
+
+
+@settings(max_examples=3)
+@given(random_tables(), st.integers(0, 1000))
+def test_rewards_for_likeness_agree_on_random_tables(tables: SceneTables, seed: int) -> None:
+    similarity, named = random_likeness(tables, seed)
+    world = World(tables, {}, STEP_LIMITS, similarity=named)
+    nobody = no_parents(tables)
+    params = env.make_params(
+        tables, in_use(tables), nobody, STEP_LIMITS, False, similarity=similarity
+    )
+    assert_worlds_agree(world, params, batch=8, steps=20, seed=seed)
+
+
 def check_random_tables(tables: SceneTables, seed: int) -> None:
     parents, named = random_parents(tables, seed)
     world = World(tables, named, STEP_LIMITS)
@@ -214,11 +250,6 @@ def check_observations(tables: SceneTables, merge: bool, states: np.ndarray) -> 
     for row, pose in enumerate(states):
         expected = world.detections(int(pose), merge)
         assert_same_detections(detections_of(obs, row, tables), expected)
-
-
-def no_parents(tables: SceneTables) -> Parents:
-    shape = (len(tables.targets), 3)
-    return Parents(np.full(shape, -1, np.int32), np.zeros(shape, np.float32))
 
 
 @pytest.mark.parametrize("merge", [False, True])

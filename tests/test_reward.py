@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tdanet_jax import env, reward
+from tdanet_jax.config import LearnerConfig, TrainConfig
 from tdanet_jax.env import EnvState
 from tdanet_jax.reward import Parents, find_parents
 from tdanet_jax.scenes import SceneTables
+from tdanet_jax.task import make_task
 from tdanet_jax.vocabulary import TARGETS, make_split
+from tdanet_jax.words import WordVectors
 from tests import handmade, oracle
 from tests.handmade import Room, Sighting, corridor, tables_of
 
@@ -148,16 +152,19 @@ def params() -> env.EnvParams:
     return env.make_params(tables, {"kitchen": [TARGET]}, parents, (50,) * 4, merge=False)
 
 
-def rewards(params: env.EnvParams, start: int, actions: str, heading: int = 0) -> list[float]:
+def rewards(params: env.EnvParams, state: EnvState, actions: str) -> list[float]:
     """Rewards along a walk: m moves ahead, l and r turn, d says Done."""
-    zero = jnp.int32(0)
-    state = EnvState(jnp.int32(handmade.state(start, heading)), zero, zero, zero, zero)
     found = []
     for letter in actions:
         out = env.transition(state, jnp.int32({"m": 0, "l": 1, "r": 2, "d": 5}[letter]), params)
         found.append(float(out.reward))
         state = out.state
     return found
+
+
+def standing(params: env.EnvParams, place: int, heading: int = 0) -> EnvState:
+    """An episode of the first target that starts in the corridor."""
+    return env.start(params, jnp.int32(handmade.state(place, heading)), jnp.int32(0))
 
 
 STEP = pytest.approx(-0.01)
@@ -187,13 +194,13 @@ STEP = pytest.approx(-0.01)
 def test_each_step_earns_one_of_four_values(
     params: env.EnvParams, start: int, actions: str, expected: list[float]
 ) -> None:
-    assert rewards(params, start, actions) == pytest.approx(expected)
+    assert rewards(params, standing(params, start), actions) == pytest.approx(expected)
 
 
 def test_what_is_in_view_but_beyond_reach_earns_nothing(params: env.EnvParams) -> None:
     # Turned by 90 degrees everything is in view and nothing is near.
-    assert rewards(params, 7, "d", heading=90) == [STEP]
-    assert rewards(params, 7, "r", heading=45) == [STEP]
+    assert rewards(params, standing(params, 7, 90), "d") == [STEP]
+    assert rewards(params, standing(params, 7, 45), "r") == [STEP]
 
 
 def test_a_parents_reward_is_the_one_of_its_own_target() -> None:
@@ -220,3 +227,70 @@ def test_parents_are_read_from_no_room_but_the_given_ones(ithor: SceneTables) ->
     objects[:, [0, 3]] += 100.0 * np.arange(len(objects))[:, None]  # nothing is near anything
     moved = dataclasses.replace(train, object_box=objects)
     assert (find_parents(moved, TARGETS).classes == -1).all()
+
+
+#: Cosines of a frame's classes to Mug, by position of the corridor; -1 stands for an empty frame.
+LIKENESS = {"Fridge": -0.5, "Sink": 0.25, "Apple": 0.75, "Mug": 1.0}
+VIEWS: tuple[tuple[str, ...], ...] = (
+    (), ("Sink",), ("Sink", "Fridge"), ("Apple", "Sink"), ("Sink",), ("Mug", "Fridge"), ("Fridge",),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("start", "actions", "expected"),
+    [
+        (0, "m", [0.025]),  # a tenth of the cosine instead of the step's cost
+        (1, "mm", [0.025, 0.075]),  # the first frame is paid with the first step; more is more
+        (2, "mmm", [0.075, -0.01, 0.1]),  # the largest so far counts, not the last
+        (5, "m", [-0.01]),  # a negative cosine earns nothing
+        (4, "md", [0.1, 5.1]),  # the target in view is worth 0.1, at Done again
+        (3, "d", [-0.01]),  # a Done that fails, whatever is in view
+    ],
+)
+def test_likeness_pays_when_it_is_the_largest_so_far(
+    start: int, actions: str, expected: list[float]
+) -> None:
+    objects = [(name, (0.0, 0.0, 0.0)) for name in LIKENESS]
+    sightings = {
+        handmade.state(place, 0): [Sighting(list(LIKENESS).index(name)) for name in seen]
+        for place, seen in enumerate(VIEWS)
+    }
+    room = Room("kitchen", corridor(len(VIEWS)), objects, sightings)
+    tables = tables_of([room], CLASSES, ["Mug"])
+    cosine = np.zeros((len(CLASSES), len(CLASSES)), np.float32)
+    for name, value in LIKENESS.items():
+        cosine[CLASSES.index("Mug"), CLASSES.index(name)] = value
+    similarity = reward.greatest_similarity(tables, cosine)
+    nobody = reward.no_parents(tables)
+    params = env.make_params(
+        tables, {"kitchen": ["Mug"]}, nobody, (50,) * 4, False, similarity=similarity
+    )
+    assert rewards(params, standing(params, start), actions) == pytest.approx(expected)
+
+
+def test_cosines_of_vectors_of_any_length_and_none() -> None:
+    found = reward.cosines(np.array([[3.0, 0.0], [2.0, 2.0], [0.0, 0.0], [-1.0, 0.0]]))
+    half = 0.5**0.5
+    expected = [[1, half, 0, -1], [half, 1, 0, -half], [0, 0, 0, 0], [-1, -half, 0, 1]]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("paid", ["parents", "similarity", "none"])
+def test_the_configuration_says_what_is_paid_for(
+    some_rooms: SceneTables, glove: WordVectors, paid: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    split = dataclasses.replace(
+        make_split("18/4"), train_scenes=("FloorPlan7", "FloorPlan303"), eval_scenes=()
+    )
+    monkeypatch.setattr("tdanet_jax.task.make_split", lambda *_: split)
+    config = TrainConfig(learner=LearnerConfig(partial_reward=paid))
+    task = make_task(config, some_rooms, glove)
+    params = task.train_params
+    assert bool((params.parent_class >= 0).any()) == (paid == "parents")
+    assert (params.similarity is not None) == (paid == "similarity")
+    if params.similarity is not None:
+        # The target itself in view has a cosine of 1; a hidden class in view counts for nothing.
+        visible = np.asarray(params.distance) == 0
+        np.testing.assert_allclose(np.asarray(params.similarity)[visible], 1.0, rtol=1e-6)
+        hidden = [some_rooms.targets.index(name) for name in split.hidden]
+        assert not np.asarray(params.similarity)[:, hidden].any()

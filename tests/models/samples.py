@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tdanet_jax.env import Observation
+from tdanet_jax.env import RASTER, Observation
 
 CLASSES, WIDTH, DETECTIONS = 9, 5, 6  # C, D, K
 
@@ -32,6 +32,18 @@ def observations(*shape: int, seed: int = 1) -> Observation:
         mask=jnp.asarray(mask),
         target=jnp.asarray(rng.integers(0, CLASSES, shape), jnp.int32),
         empty=jnp.asarray(count == 0),
+    )
+
+
+def one_per_class(obs: Observation, seed: int = 3) -> Observation:
+    """The same frames with classes that differ within a frame, and cells of an image."""
+    rng = np.random.default_rng(seed)
+    lead = obs.empty.shape
+    classes = rng.permuted(np.broadcast_to(np.arange(CLASSES), (*lead, CLASSES)), axis=-1)
+    cells = rng.integers(-1, CLASSES, (*lead, *RASTER))
+    return obs.replace(
+        classes=jnp.asarray(np.where(obs.mask, classes[..., :DETECTIONS], 0), jnp.int32),
+        cells=jnp.asarray(cells, jnp.int32),
     )
 
 

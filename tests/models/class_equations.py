@@ -1,0 +1,54 @@
+"""The published networks with a row per class, one frame at a time, no table, no tape.
+
+As in `equations`, every function takes the array module first: NumPy for golden values in float64,
+`jax.numpy` for gradients of the plain form. n known classes, D wide word vectors.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tests.models.equations import Array, Params, softmax
+
+
+def context(
+    seen: dict[int, tuple[float, float, float]], target: Array, words: Array, known: tuple[int, ...]
+) -> np.ndarray:
+    """[n, 5]: present, x, y, S and the cosine to the target, for every known class.
+
+    Args:
+      seen: class -> (x, y, S) of the classes in view, whichever they are.
+      target: [D], the target's word vector.
+      words: [C, D].
+    """
+    rows = []
+    for cls in known:
+        here = (1.0, *seen[cls]) if cls in seen else (0.0, 0.0, 0.0, 0.0)
+        length = np.linalg.norm(words[cls]) * np.linalg.norm(target)
+        rows.append((*here, float(words[cls] @ target) / length if length else 0.0))
+    return np.array(rows)
+
+
+def ssnet(xp: Any, params: Params, rows: Array) -> Array:
+    """[5 n]: softmax(Q K^T) V of the rows [n, 5] (Zhao et al. 2023, Eq. 3)."""
+    query, key, value = (rows @ params[name] for name in ("query", "key", "value"))
+    return (xp.stack([softmax(xp, row) for row in query @ key.T]) @ value).reshape(-1)
+
+
+def frames(obs: Any, words: Array) -> list[tuple[dict[int, Any], Array]]:
+    """What is seen and the target's word vector, of each frame of a flat batch."""
+    return [
+        (
+            {
+                int(cls): tuple(float(v) for v in box)
+                for cls, box, valid in zip(classes, boxes, mask, strict=True)
+                if valid
+            },
+            np.asarray(words[int(target)], np.float64),
+        )
+        for classes, boxes, mask, target in zip(
+            *(np.asarray(x) for x in (obs.classes, obs.boxes, obs.mask, obs.target)), strict=True
+        )
+    ]
