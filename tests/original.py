@@ -83,6 +83,7 @@ def write_all(root: Path) -> Path:
     with fake_torch():
         (gcn / "adjmat.dat").write_bytes(torch_save(np.arange(16).reshape(4, 4)))
         (split / "kitchen_test.pkl").write_bytes(pickle.dumps(episodes(EPISODES)))
+        (split / "notes.pkl").write_bytes(b"of another kind, not read")
         (split / "kitchen_val.pkl").write_bytes(pickle.dumps(episodes(EPISODES[:1])))
     return scenes
 

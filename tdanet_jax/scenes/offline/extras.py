@@ -16,6 +16,8 @@ from tdanet_jax.vocabulary import ROOM_TYPES
 
 MOST_EPISODES, MOST_CLASSES = 100_000, 2_000
 LARGEST_REWARD = 100.0
+#: Lists of episodes are called <room>_test.pkl and <room>_val.pkl.
+PARTS = ("test", "val")
 EPISODE_FOLDER, GRAPH_FOLDER = "test_val_split", "gcn"
 GRAPH_CLASSES, GRAPH_MATRIX = "objects.txt", "adjmat.dat"
 
@@ -44,7 +46,7 @@ def read_extras(folders: Iterable[Path], grids: Mapping[str, Grid]) -> tuple[Ext
     if published is not None:
         episodes: list[PublishedEpisode] = []
         left = 0
-        for path in sorted(published.glob("*_*.pkl")):
+        for path in sorted(p for part in PARTS for p in published.glob(f"*_{part}.pkl")):
             kept, others = read_episodes(path, grids)
             episodes, left = episodes + kept, left + others
         extras = dataclasses.replace(extras, episodes=tuple(episodes))
@@ -112,7 +114,7 @@ def read_episodes(path: Path, grids: Mapping[str, Grid]) -> tuple[list[Published
         FileError: it is not a list of episodes, or a start is not on its scene's grid.
     """
     part = path.stem.rpartition("_")[2]
-    if part not in ("test", "val") or path.stat().st_size > pickles.LARGEST_FILE:
+    if part not in PARTS or path.stat().st_size > pickles.LARGEST_FILE:
         raise FileError(path, "not named <room>_test.pkl or <room>_val.pkl, or too large")
     records = pickles.load(path.read_bytes(), path)
     if not isinstance(records, list) or len(records) > MOST_EPISODES:
