@@ -13,6 +13,7 @@ from __future__ import annotations
 import io
 import math
 import pickletools
+import warnings
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -283,7 +284,8 @@ def _load_zip(data: bytes, path: str) -> Any:
 def _run(stream: io.BytesIO, path: str) -> tuple[Any, list[Storage]]:
     machine = _Machine(path)
     try:
-        return machine.run(stream), machine.storages
+        with warnings.catch_warnings(action="ignore"):  # pickletools' own, about odd escapes
+            return machine.run(stream), machine.storages
     except FileError:
         raise
     except Exception as error:  # pickletools and an empty stack raise many kinds
