@@ -19,6 +19,7 @@ MODELS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "tdanet-no-sa": ("tdanet_jax.models.tdanet", {"siamese": False}),
     "tdanet-no-ta-sa": ("tdanet_jax.models.tdanet", {"target_attention": False, "siamese": False}),
     "ssnet": ("tdanet_jax.models.ssnet", {}),
+    "mjolnir-o": ("tdanet_jax.models.mjolnir", {}),
 }
 #: Name of the file in a run's folder that holds its configuration.
 CONFIG_FILE = "config.json"
@@ -92,8 +93,8 @@ class TrainConfig:
     """Seen/unseen target classes: 22/0, 18/4 or 14/8."""
     model: str = "tdanet"
     """The model to train: tdanet, one of its ablations (tdanet-no-ta without target attention,
-    tdanet-no-sa without the Siamese comparison, tdanet-no-ta-sa without either), ssnet, or the
-    dotted name of a module of your own that has a function `make`."""
+    tdanet-no-sa without the Siamese comparison, tdanet-no-ta-sa without either), ssnet,
+    mjolnir-o, or the dotted name of a module of your own that has a function `make`."""
     steps: int = 12_000_000
     """Budget in environment steps (actions)."""
     episodes: int | None = None

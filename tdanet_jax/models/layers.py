@@ -19,9 +19,6 @@ from flax import linen as nn
 
 TAPE = "tape"
 
-#: What torch.nn.Linear draws its weights from: uniform in plus or minus fan_in^-1/2.
-TORCH_UNIFORM = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
-
 #: A recurrent state: hidden and cell, each [B, H] float32.
 Carry = tuple[jax.Array, jax.Array]
 
@@ -149,6 +146,45 @@ def recorded(module: nn.Module, name: str, compute: Callable[[], Any]) -> Any:
         module.put_variable(TAPE, name, value)
         return value
     return module.get_variable(TAPE, name) if module.has_variable(TAPE, name) else compute()
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def recall(function: Callable[[Any, Any], jax.Array], weights: Any, x: Any, value: Any) -> Any:
+    """`function(weights, x_t)` of every step of a rollout, where `value` is what it has given.
+
+    The backward pass goes through one step at a time and computes it again, so that nothing but
+    the results is kept of a function whose parts are large.
+
+    Args:
+      function: from the batch of one step to an array.
+      weights: arrays that get a gradient.
+      x: arrays [T, ...] that get none.
+      value: [T, ...], for one from `recorded`.
+    """
+    return value
+
+
+def _recall_fwd(
+    function: Callable[[Any, Any], jax.Array], weights: Any, x: Any, value: Any
+) -> tuple[Any, tuple]:
+    return value, (weights, x)
+
+
+def _recall_bwd(
+    function: Callable[[Any, Any], jax.Array], saved: tuple, cotangent: Any
+) -> tuple[Any, None, None]:
+    weights, x = saved
+
+    def body(total: Any, step: tuple) -> tuple[Any, None]:
+        x_t, cotangent_t = step
+        pull = jax.vjp(lambda weights: function(weights, x_t), weights)[1]
+        return jax.tree.map(jnp.add, total, pull(cotangent_t)[0]), None
+
+    zeros = jax.tree.map(jnp.zeros_like, weights)
+    return jax.lax.scan(body, zeros, (x, cotangent))[0], None, None
+
+
+recall.defvjp(_recall_fwd, _recall_bwd)
 
 
 class Linear(nn.Module):

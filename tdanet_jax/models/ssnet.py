@@ -20,9 +20,13 @@ from tdanet_jax.config import NetworkConfig
 from tdanet_jax.env import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.layers import TORCH_UNIFORM, recorded
+from tdanet_jax.models.layers import recorded
 from tdanet_jax.models.rows import COLUMNS, RowTable, class_rows, make_table
 
+#: W_Q and W_K start as this times the unit matrix, W_V as the other, each with a little noise. From
+#: torch's small random start a row's attention is even over a hundred rows, all outputs are alike,
+#: and a million steps teach nothing; from a sharp start rows attend rows that are like them.
+SHARP, LARGE, NOISE = 6.0, 4.0, 0.1
 #: Columns i <= j of the products of two columns of a row.
 PAIRS = np.triu_indices(COLUMNS)
 
@@ -40,10 +44,11 @@ class SSNetEncoder(Encoder):
     ACTION = "plain"
 
     def setup(self) -> None:
-        shape = (COLUMNS, COLUMNS)
-        self.query, self.key, self.value = (
-            self.param(name, TORCH_UNIFORM, shape) for name in ("query", "key", "value")
-        )
+        def matrix(name: str, scale: float) -> jax.Array:
+            return self.param(name, lambda key: near_unit(key, scale))
+
+        self.query, self.key = matrix("query", SHARP), matrix("key", SHARP)
+        self.value = matrix("value", LARGE)
 
     def prepare(self, words: jax.Array) -> RowTable:
         """Rows and cosines, from word vectors [C, D]."""
@@ -58,6 +63,11 @@ class SSNetEncoder(Encoder):
         found = recorded(self, "moments", lambda: moments(jax.lax.stop_gradient(mixing), rows))
         out = attend(mixing, rows, found) @ self.value
         return out.reshape(*obs.empty.shape, -1)
+
+
+def near_unit(key: jax.Array, scale: float) -> jax.Array:
+    """The unit matrix [5, 5], scaled, with noise."""
+    return scale * jnp.eye(COLUMNS) + NOISE * jax.random.normal(key, (COLUMNS, COLUMNS))
 
 
 def moments(mixing: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:

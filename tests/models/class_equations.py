@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.models.equations import Array, Params, softmax
+from tests.models.equations import Array, Params, linear, relu, softmax
 
 
 def context(
@@ -35,6 +35,26 @@ def ssnet(xp: Any, params: Params, rows: Array) -> Array:
     """[5 n]: softmax(Q K^T) V of the rows [n, 5] (Zhao et al. 2023, Eq. 3)."""
     query, key, value = (rows @ params[name] for name in ("query", "key", "value"))
     return (xp.stack([softmax(xp, row) for row in query @ key.T]) @ value).reshape(-1)
+
+
+def mjolnir_graph(
+    xp: Any, params: Params, rows: Array, words: Array, known: tuple[int, ...]
+) -> Array:
+    """[H]: the graph's features of the rows [n, 5] (Qiu et al. 2020, as published in code)."""
+    a, n = params["adjacency"], len(known)
+    present = xp.broadcast_to(rows[:, 0], (n, n))  # every node sees the presence of all
+    x = xp.concatenate([present, xp.asarray(words[np.array(known)])], axis=1)  # [n, n + D]
+    for layer in ("kernels_0", "kernels_1", "kernels_2"):
+        x = relu(xp, (a @ x) @ params[layer]["kernel"])
+    x = xp.concatenate([x, rows], axis=1)  # [n, 10]
+    x = relu(xp, (a @ x) @ params["kernels_3"]["kernel"])[:, 0]
+    return linear(params["mapping"], x)
+
+
+def mjolnir_o(xp: Any, params: Params, rows: Array, words: Array, known: tuple[int, ...]) -> Array:
+    """[H + 5 n]: the graph's features and the context."""
+    features = mjolnir_graph(xp, params["graph"], rows, words, known)
+    return xp.concatenate([features, rows.reshape(-1)])
 
 
 def frames(obs: Any, words: Array) -> list[tuple[dict[int, Any], Array]]:

@@ -1,0 +1,132 @@
+"""MJOLNIR's encoders against the published equations, and where their graph comes from."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tdanet_jax import graph
+from tdanet_jax.classes import Classes
+from tdanet_jax.env import Observation
+from tdanet_jax.models.layers import TAPE
+from tdanet_jax.models.mjolnir import MjolnirOEncoder
+from tests.models import class_equations, equations, samples
+from tests.models.samples import CLASSES, WIDTH
+
+KNOWN = (0, 1, 3, 4, 6, 8)
+VOCABULARY = Classes(
+    tuple(f"Class{i}" for i in range(CLASSES)), KNOWN, ((0, 3, 1.0), (1, 3, 1.0), (4, 8, 0.5))
+)
+T, B, H = 3, 4, 7
+WORDS = jnp.asarray(samples.words())
+#: Sums of a few dozen float32 products, in another order.
+CLOSE = {"rtol": 1e-4, "atol": 1e-5}
+
+encoder = MjolnirOEncoder(classes=VOCABULARY, features=H)
+
+
+def observations(*shape: int, seed: int = 1) -> Observation:
+    return samples.one_per_class(samples.observations(*shape, seed=seed))
+
+
+def both(module: MjolnirOEncoder, words: jax.Array, obs: Observation) -> jax.Array:
+    return module(module.prepare(words), obs, None)
+
+
+@functools.cache
+def fresh_parameters() -> Any:
+    return encoder.init(jax.random.key(0), WORDS, observations(2), method=both)["params"]
+
+
+def parameters() -> Any:
+    """Random ones; the adjacency is not symmetric, as it may become by training."""
+    return samples.randomised(fresh_parameters())
+
+
+@jax.jit
+def features(params: Any, obs: Observation, words: jax.Array = WORDS, tape: Any = None) -> Any:
+    variables = {"params": params} if tape is None else {"params": params, TAPE: tape}
+    return encoder.apply(variables, words, obs, method=both)
+
+
+def rows_of(obs: Observation) -> list[np.ndarray]:
+    words = np.asarray(WORDS, np.float64)
+    return [
+        class_equations.context(*frame, words, KNOWN)
+        for frame in class_equations.frames(obs, words)
+    ]
+
+
+def test_the_features_are_those_of_the_published_equations() -> None:
+    obs = observations(12)
+    found = features(parameters(), obs)
+    assert found.shape == (12, H + 5 * len(KNOWN))
+    exact, words = equations.in_float64(parameters()), np.asarray(WORDS, np.float64)
+    expected = [class_equations.mjolnir_o(np, exact, rows, words, KNOWN) for rows in rows_of(obs)]
+    np.testing.assert_allclose(found, np.stack(expected), **CLOSE)
+
+
+@pytest.mark.parametrize("taped", [False, True], ids=["computed", "from the tape"])
+def test_the_gradient_is_that_of_the_published_equations(taped: bool) -> None:
+    obs = observations(T, B)
+    mix = np.random.default_rng(4).normal(size=(T, B, H + 5 * len(KNOWN))).astype(np.float32)
+    contexts = [jnp.asarray(rows, jnp.float32) for rows in rows_of(samples.flat(obs))]
+    tape = None
+    if taped:
+
+        def act(obs: Observation) -> Any:
+            variables = {"params": parameters()}
+            return encoder.apply(variables, WORDS, obs, method=both, mutable=[TAPE])[1][TAPE]
+
+        tape = jax.vmap(act)(obs)
+
+    def fast(params: Any) -> jax.Array:
+        return (features(params, obs, WORDS, tape) * mix).sum()
+
+    def slow(params: Any) -> jax.Array:
+        found = [class_equations.mjolnir_o(jnp, params, rows, WORDS, KNOWN) for rows in contexts]
+        return (jnp.stack(found) * mix.reshape(T * B, -1)).sum()
+
+    found, expected = jax.grad(fast)(parameters()), jax.jit(jax.grad(slow))(parameters())
+    chex.assert_trees_all_close(found, expected, rtol=1e-3, atol=1e-3)
+
+
+def test_layers_and_their_sizes_and_the_graph_at_the_start() -> None:
+    n, h = len(KNOWN), len(KNOWN) + WIDTH
+    assert jax.tree.map(jnp.shape, fresh_parameters()) == {
+        "graph": {
+            "adjacency": (n, n),
+            "kernels_0": {"kernel": (h, h)},
+            "kernels_1": {"kernel": (h, h)},
+            "kernels_2": {"kernel": (h, 5)},
+            "kernels_3": {"kernel": (10, 1)},
+            "mapping": {"kernel": (n, H), "bias": (H,)},
+        }
+    }
+    adjacency = fresh_parameters()["graph"]["adjacency"]
+    np.testing.assert_array_equal(adjacency, graph.normalised(VOCABULARY))
+
+
+def test_a_bfloat16_encoder_is_close_and_returns_float32() -> None:
+    obs, params = observations(12), parameters()
+    half = MjolnirOEncoder(classes=VOCABULARY, features=H, dtype=jnp.bfloat16)
+    found = half.apply({"params": params}, WORDS, obs, method=both)
+    assert found.dtype == jnp.float32
+    full = features(params, obs)
+    np.testing.assert_allclose(found, full, atol=0.05 * float(jnp.abs(full).max()))
+    assert not np.array_equal(found, full)
+
+
+def test_blind_to_classes_that_it_does_not_know() -> None:
+    obs = observations(12)
+    unknown = ~np.isin(obs.classes, KNOWN)
+    noise = jnp.asarray(np.random.default_rng(5).random(obs.boxes.shape), jnp.float32)
+    other = obs.replace(boxes=jnp.where(unknown[..., None], noise, obs.boxes))
+    assert (np.asarray(other.boxes) != obs.boxes).any()
+    chex.assert_trees_all_equal(features(parameters(), obs), features(parameters(), other))
