@@ -12,6 +12,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib.util
+import os
+import signal
 import sys
 import time
 import warnings
@@ -24,6 +26,7 @@ import tyro
 from experiments.console import (
     StopRequest,
     check_empty,
+    check_positive,
     console,
     fail,
     one_line_errors,
@@ -37,6 +40,7 @@ from tdanet_jax.config import CONFIG_FILE, PRESETS, TrainConfig
 
 if TYPE_CHECKING:
     from tdanet_jax.episodes import Episodes
+    from tdanet_jax.task import Task
     from tdanet_jax.training import Row, Run
 
 
@@ -50,9 +54,14 @@ class Command:
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""
     resume: Path | None = None
-    """Folder of a run to go on with, to its original budget; takes no other flag."""
+    """Folder of a run to go on with, to its original budget; beside it, --devices and
+    --tensorboard alone."""
     tensorboard: bool = False
     """Also write TensorBoard events (needs tensorboardX)."""
+    devices: int = 1
+    """Devices to split the environments over, in this process; a CPU is split into as many. More
+    processes, here or on other machines, join through JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES
+    and JAX_PROCESS_ID."""
 
 
 def parse_command(arguments: list[str]) -> Command:
@@ -71,18 +80,28 @@ def main(arguments: list[str] | None = None) -> None:
     with one_line_errors():
         command = parse_command(words)
         if command.resume is not None:
-            if len(words) > 2:
-                fail("--resume goes on to the original budget and takes no other flag")
+            if dataclasses.replace(command, devices=1, tensorboard=False) != Command(
+                run=TrainConfig(), resume=command.resume
+            ):
+                fail(
+                    "--resume goes on to the original budget: beside it, --devices and "
+                    "--tensorboard alone"
+                )
             folder, config = command.resume, configs.load(command.resume / CONFIG_FILE)
         else:
             config = command.run
             config.check()
             config = config.with_absolute_paths()
+            joined = bool(os.environ.get("JAX_COORDINATOR_ADDRESS"))
+            if command.out is None and joined:
+                fail("a run of several processes needs --out: a folder that all of them see")
             folder = command.out or default_folder(config)
-            check_new(folder)
+            if not joined:
+                check_new(folder)
+        check_positive(devices=command.devices)
         if command.tensorboard and importlib.util.find_spec("tensorboardX") is None:
             fail("--tensorboard needs tensorboardX: pip install 'tdanet-jax[tensorboard]'")
-        train(config, folder, command.tensorboard, resume=command.resume is not None)
+        train(config, folder, command)
 
 
 def check_new(folder: Path) -> None:
@@ -97,30 +116,44 @@ def default_folder(config: TrainConfig) -> Path:
     return Path("runs") / f"{split}-{config.model}-seed{config.seed}-{stamp}"
 
 
-def train(config: TrainConfig, folder: Path, tensorboard: bool, resume: bool = False) -> None:
+def train(config: TrainConfig, folder: Path, command: Command) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
-    from tdanet_jax import episodes, files
-    from tdanet_jax.checkpoint import FOLDER
+    from tdanet_jax import devices, episodes, files
     from tdanet_jax.task import load_task, resolve_precision
     from tdanet_jax.training import Run
 
     with stoppable(lambda: how_to_go_on(folder)) as stop:
+        mesh = devices.connect(command.devices)
+        devices.keep_compiled()
+        console.quiet = not devices.is_lead()
         with reporter("rooms", every=30, transient=True) as report_rooms:
             task = load_task(config, lambda done, total: report_rooms(done / total, "rebuilt"))
         lists = episodes.load(task.tables, task.split, task.extras)
         # What `auto` means here is part of the run: it goes on with the same products elsewhere.
         config = dataclasses.replace(config, network=resolve_precision(config.network))
-        with files.locked(folder):
-            if not resume:
-                check_new(folder)  # again: another process may have begun there meanwhile
-            for path in files.remove_partial(folder) + files.remove_partial(folder / FOLDER):
-                console.print(f"removed {path}: half-written when the run was stopped")
-            configs.save(config, folder / CONFIG_FILE)
-            task.classes.save(folder)
-            run = Run(folder, config, task)
+        with files.locked(folder) if devices.is_lead() else contextlib.nullcontext():
+            if devices.is_lead():
+                prepare(folder, config, task, resume=command.resume is not None)
+            devices.wait_for_all("the folder is there")
+            run = Run(folder, config, task, mesh)
+            devices.wait_for_all("the run is loaded")  # before anyone writes
             console.print(f"{title(run)} -> {folder}")
-            learn(run, tensorboard, stop)
-            report_on(run, lists)
+            learn(run, command.tensorboard and devices.is_lead(), stop)
+            if devices.is_lead():
+                report_on(run, lists)
+
+
+def prepare(folder: Path, config: TrainConfig, task: Task, resume: bool) -> None:
+    """What a run finds in its folder when it begins."""
+    from tdanet_jax import files
+    from tdanet_jax.checkpoint import FOLDER
+
+    if not resume:
+        check_new(folder)  # again: another process may have begun there meanwhile
+    for path in files.remove_partial(folder) + files.remove_partial(folder / FOLDER):
+        console.print(f"removed {path}: half-written when the run was stopped")
+    configs.save(config, folder / CONFIG_FILE)
+    task.classes.save(folder)
 
 
 def how_to_go_on(folder: Path) -> str:
@@ -139,7 +172,9 @@ def title(run: Run) -> str:
 
 
 def learn(run: Run, tensorboard: bool, stop: StopRequest) -> None:
-    """Trains to the end of the budget or to a signal, and saves."""
+    """Trains to the end of the budget or to a signal in any process, and saves."""
+    from tdanet_jax import devices
+
     run.save()  # who cannot save learns it before training, not after
     saved = run.seconds
     console.print("compiling ...")
@@ -151,7 +186,8 @@ def learn(run: Run, tensorboard: bool, stop: StopRequest) -> None:
         for row in run.chunks():
             show(run.progress, figures_of(row))
             sink(row)
-            if stop.signal is not None:
+            if devices.anywhere(stop.signal is not None):
+                stop.signal = stop.signal or signal.SIGTERM
                 break
             if run.seconds - saved > 60 * run.config.checkpoint_minutes:
                 run.save()
@@ -207,6 +243,8 @@ def metrics_sink(folder: Path, tensorboard: bool) -> Iterator[Callable[[Row], No
 
 def report_on(run: Run, lists: Mapping[str, Episodes]) -> None:
     """Evaluates the agent and writes the results and the learning curve."""
+    import jax
+
     from tdanet_jax import evaluation, figures, policies, report
     from tdanet_jax.training import read_metrics
 
@@ -214,7 +252,8 @@ def report_on(run: Run, lists: Mapping[str, Episodes]) -> None:
     console.print("evaluating ...")
     task, seed = run.task, run.config.seed
     policy = policies.network(run.model, task.words)
-    played = evaluation.evaluate_lists(policy, run.state.params, task.eval_params, lists, seed)
+    weights = jax.device_get(run.state.params)
+    played = evaluation.evaluate_lists(policy, weights, task.eval_params, lists, seed)
     provenance = report.Provenance(
         split=task.split.name,
         model=run.config.model,

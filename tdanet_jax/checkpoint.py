@@ -1,8 +1,9 @@
 """Checkpoints of a run (Orbax): everything that is needed to go on bit for bit.
 
 `DIR/checkpoints/<updates>/` holds `state` (parameters, optimiser, episodes in progress, recurrent
-state, random key, counters), `meta` (JSON: format version, training time, data version) and
-`SHA256SUMS`, the checksums of all its files (`sha256sum -c SHA256SUMS` checks them, too).
+state, random key, counters; plain arrays, whichever devices they lay on), `meta` (JSON: format
+version, training time, data version) and `SHA256SUMS`, the checksums of all its files
+(`sha256sum -c SHA256SUMS` checks them, too).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
 
 from tdanet_jax import assets, files
@@ -38,7 +40,17 @@ class Checkpoints:
 
     def __init__(self, run: Path) -> None:
         self.folder = (run / FOLDER).absolute()
-        self._orbax = ocp.Checkpointer(ocp.CompositeCheckpointHandler())
+        # Every process reads for itself, and one alone writes: none waits for the others.
+        here = jax.process_index()
+        alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
+        self._orbax = ocp.Checkpointer(
+            ocp.CompositeCheckpointHandler(
+                composite_options=ocp.CompositeOptions(multiprocessing_options=alone),
+                state=ocp.StandardCheckpointHandler(multiprocessing_options=alone),
+                meta=ocp.JsonCheckpointHandler(multiprocessing_options=alone),
+            ),
+            multiprocessing_options=alone,
+        )
 
     def save(self, state: TrainState, meta: dict[str, Any]) -> None:
         """Writes a checkpoint; it appears complete or not at all. The newest two are kept.
@@ -55,7 +67,7 @@ class Checkpoints:
             self._orbax.save(
                 fresh,
                 args=ocp.args.Composite(
-                    state=ocp.args.StandardSave(_plain(state)),
+                    state=ocp.args.StandardSave(jax.device_get(_plain(state))),
                     meta=ocp.args.JsonSave({**meta, "format": FORMAT}),
                 ),
             )
@@ -86,7 +98,9 @@ class Checkpoints:
         Raises:
           ValueError: there is no checkpoint, or none that fits this configuration.
         """
-        state, meta = self._read(jax.eval_shape(_plain, jax.eval_shape(make_state)))
+        shapes = jax.eval_shape(_plain, jax.eval_shape(make_state))
+        blank = jax.tree.map(lambda x: np.empty(x.shape, x.dtype), shapes)
+        state, meta = self._read(blank)
         return state.replace(key=jax.random.wrap_key_data(state.key)), meta
 
     def weights(self) -> Any:
@@ -114,11 +128,11 @@ class Checkpoints:
         names = (path.name for path in self.folder.glob("*") if path.is_dir())
         return sorted((int(name) for name in names if name.isdecimal()), reverse=True)
 
-    def _read(self, shapes: Any) -> tuple[Any, dict[str, Any]]:
+    def _read(self, blank: Any) -> tuple[Any, dict[str, Any]]:
         faults: list[Exception] = []
         for step in self._steps():
             try:
-                found = self._read_one(self.folder / str(step), shapes)
+                found = self._read_one(self.folder / str(step), blank)
             except NewerFormat:
                 raise  # it is sound: no older one shall be taken in its place
             except (ValueError, OSError) as error:
@@ -129,23 +143,36 @@ class Checkpoints:
             return found
         raise faults[0] if faults else ValueError(f"{self.folder}: no checkpoint")
 
-    def _read_one(self, path: Path, shapes: Any) -> tuple[Any, dict[str, Any]]:
+    def _read_one(self, path: Path, blank: Any) -> tuple[Any, dict[str, Any]]:
         _verify(path)
         try:
             meta = self._orbax.restore(path, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
             written = meta["meta"]["format"]
             if written <= FORMAT:
                 state = self._orbax.restore(
-                    path, args=ocp.args.Composite(state=ocp.args.StandardRestore(shapes))
+                    path, args=ocp.args.Composite(state=ocp.args.StandardRestore(blank))
                 )
         except Exception as error:  # Orbax raises many kinds for a damaged folder
             raise ValueError(f"{path}: unreadable checkpoint ({_reason(error)})") from error
+        if written <= FORMAT and blank is not None:
+            _check_shapes(path, state["state"], blank)
         if written > FORMAT:
             raise NewerFormat(
                 f"{path}: checkpoint of format {written}, this version reads up to {FORMAT}: "
                 "a newer tdanet_jax wrote it"
             )
         return state["state"], dict(meta["meta"])
+
+
+def _check_shapes(path: Path, found: Any, blank: Any) -> None:
+    """Raises ValueError if an array is not of the size that the configuration asks for."""
+    for (where, value), expected in zip(
+        jax.tree_util.tree_leaves_with_path(found), jax.tree.leaves(blank), strict=True
+    ):
+        if value.shape != expected.shape or value.dtype != expected.dtype:
+            name = jax.tree_util.keystr(where)
+            reason = f"{name} is {value.dtype}{value.shape}, not {expected.dtype}{expected.shape}"
+            raise ValueError(f"{path}: unreadable checkpoint ({reason})")
 
 
 def _plain(state: TrainState) -> TrainState:

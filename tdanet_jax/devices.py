@@ -56,6 +56,9 @@ def connect(count: int = 1) -> Mesh:
             processes, process = int(os.environ[PROCESSES]), int(os.environ[PROCESS])
         except (KeyError, ValueError):
             raise ValueError(f"{ADDRESS} is set: {PROCESSES} and {PROCESS} must be, too") from None
+        # Processes on CPUs wait for each other for ever if each orders its sums as it likes.
+        flag = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}"
         jax.distributed.initialize(os.environ[ADDRESS], processes, process)
     if jax.local_device_count() < count:
         raise ValueError(f"--devices {count}: this machine has {jax.local_device_count()}")
@@ -63,6 +66,11 @@ def connect(count: int = 1) -> Mesh:
     for process in range(jax.process_count()):
         chosen += [d for d in jax.devices() if d.process_index == process][:count]
     return Mesh(np.array(chosen), (AXIS,))
+
+
+def first() -> Mesh:
+    """The first device alone."""
+    return Mesh(np.array(jax.local_devices()[:1]), (AXIS,))
 
 
 def is_lead() -> bool:
@@ -87,6 +95,19 @@ def anywhere(flag: bool) -> bool:
 def everywhere(mesh: Mesh) -> NamedSharding:
     """On every device as a whole."""
     return NamedSharding(mesh, PartitionSpec())
+
+
+def whole(tree: Any, mesh: Mesh) -> Any:
+    """The arrays with every part in this process, which a file can be written from."""
+    if jax.process_count() == 1:
+        return tree
+    return jax.jit(lambda x: x, out_shardings=everywhere(mesh))(tree)
+
+
+def wait_for_all(reason: str) -> None:
+    """Returns when every process has come here."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(reason)
 
 
 def split(mesh: Mesh) -> NamedSharding:

@@ -13,10 +13,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
-from tdanet_jax import files, history, learner
+from tdanet_jax import devices, files, history, learner
 from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.config import TrainConfig
+from tdanet_jax.env import EnvParams
 from tdanet_jax.learner import TrainState
 from tdanet_jax.task import Task
 
@@ -28,8 +30,17 @@ Row = dict[str, Any]
 class Run:
     """A run in its folder. `state` is where it is, `seconds` the training time so far."""
 
-    def __init__(self, folder: Path, config: TrainConfig, task: Task) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        config: TrainConfig,
+        task: Task,
+        mesh: Mesh | None = None,
+    ) -> None:
         """The run in `folder`, new or as its newest checkpoint has it.
+
+        Args:
+          mesh: the devices that the environments are split over; by default the first alone.
 
         Raises:
           ValueError: the checkpoint does not fit the configuration or the rooms.
@@ -39,24 +50,35 @@ class Run:
         self.task = task
         self.model = task.model
         self.seconds = 0.0
+        self._mesh = mesh or devices.first()
+        self._shared = devices.everywhere(self._mesh)
+        self._words, self._params = jax.device_put(
+            (task.train_words, task.train_params), self._shared
+        )
+        shapes = jax.eval_shape(self._init, jax.random.key(0), self._words, self._params)
+        self._layout = devices.layout(shapes, self._mesh)
         self.checkpoints = Checkpoints(folder)
         self._saved: int | None = None  # updates of the checkpoint that holds the present state
-        self.state: TrainState = self._make_state() if self.fresh else self._restore()
+        self.state: TrainState = self._begin() if self.fresh else self._restore()
 
     @property
     def fresh(self) -> bool:
         """Whether the folder holds no checkpoint yet."""
         return self.checkpoints.latest() is None
 
-    def _make_state(self) -> TrainState:
-        task = self.task
+    def _init(self, key: jax.Array, words: jax.Array, params: EnvParams) -> TrainState:
+        return learner.init(key, self.config.learner, self.model, words, params)
+
+    def _begin(self) -> TrainState:
         key = jax.random.key(self.config.seed)
-        return learner.init(
-            key, self.config.learner, self.model, task.train_words, task.train_params
-        )
+        init = jax.jit(self._init, out_shardings=self._layout)
+        return init(key, self._words, self._params)
 
     def _restore(self) -> TrainState:
-        state, meta = self.checkpoints.restore(self._make_state)
+        def make_state() -> TrainState:
+            return self._init(jax.random.key(0), self._words, self._params)
+
+        state, meta = self.checkpoints.restore(make_state)
         if meta["data_version"] != self.task.tables.data_version:
             raise ValueError(
                 f"{self.folder}: trained on scene tables {meta['data_version']}, "
@@ -64,7 +86,7 @@ class Run:
             )
         self.seconds = float(meta["seconds"])
         self._saved = int(state.updates)
-        return state
+        return jax.device_put(state, self._layout)
 
     def save(self) -> None:
         """Writes a checkpoint of the present state, unless there is one.
@@ -74,7 +96,9 @@ class Run:
         """
         if self._saved != int(self.state.updates):
             version = self.task.tables.data_version
-            self.checkpoints.save(self.state, {"seconds": self.seconds, "data_version": version})
+            state = devices.whole(self.state, self._mesh)
+            if devices.is_lead():
+                self.checkpoints.save(state, {"seconds": self.seconds, "data_version": version})
             self._saved = int(self.state.updates)
 
     @property
@@ -99,14 +123,18 @@ class Run:
     def chunks(self) -> Iterator[Row]:
         """Trains to the end of the budget; yields one row of metrics per chunk.
 
+        Of several processes, the lead alone writes files.
+
         Compilation is not counted as training time. Stop iterating to stop training; `save` then
         keeps what is done.
 
         Raises:
           ValueError: too many updates were skipped; the state is saved first.
         """
-        journal = Journal(self.folder / METRICS_FILE, int(self.state.updates))
-        history.drop_after(self.folder, int(self.state.updates))
+        journal = None
+        if devices.is_lead():
+            journal = Journal(self.folder / METRICS_FILE, int(self.state.updates))
+            history.drop_after(self.folder, int(self.state.updates))
         chunk = self._compile()
         while self.progress < 1.0:
             before = self.progress
@@ -116,15 +144,14 @@ class Run:
             pace = before / chunks_done if chunks_done else 0.0
             share = jnp.array([before, min(1.0, before + pace)], jnp.float32)
             began = time.perf_counter()
-            self.state, metrics = chunk(
-                self.state, share, self.task.train_words, self.task.train_params
-            )
+            self.state, metrics = chunk(self.state, share, self._words, self._params)
             metrics = jax.device_get(metrics)
-            took = time.perf_counter() - began
+            took = devices.from_lead(time.perf_counter() - began)
             self.seconds += took
             row = self._row(metrics, took)
-            journal.write(row)
-            self._keep_point(before)
+            if journal is not None:
+                journal.write(row)
+                self._keep_point(before)
             yield row
             if row["skipped"] >= self.config.max_skipped:
                 self.save()
@@ -157,10 +184,10 @@ class Run:
         )
 
     def _compile(self) -> jax.stages.Compiled:
-        task, config = self.task, self.config
-        chunk = learner.make_train(config.learner, self.model, config.chunk_updates)
+        config, places = self.config, (self._layout, self._shared)
+        chunk = learner.make_train(config.learner, self.model, config.chunk_updates, places)
         share = jnp.zeros(2, jnp.float32)
-        return chunk.lower(self.state, share, task.train_words, task.train_params).compile()
+        return chunk.lower(self.state, share, self._words, self._params).compile()
 
     def _row(self, metrics: dict[str, np.ndarray], took: float) -> Row:
         """One line of `metrics.jsonl`: means over the chunk's episodes and steps."""

@@ -10,14 +10,16 @@ from typing import Any
 TINY = ("--num-envs", "8", "--rollout-steps", "5", "--width", "16", "--hidden", "16")
 
 
-def start(module: str, *arguments: str | Path, **options: Any) -> subprocess.Popen[str]:
+def start(
+    module: str, *arguments: str | Path, variables: dict[str, str] | None = None, **options: Any
+) -> subprocess.Popen[str]:
     """Starts `python -m experiments.<module>`; its output can be read at once."""
     return subprocess.Popen(
         [sys.executable, "-m", f"experiments.{module}", *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PYTHONPATH": os.getcwd(), "PYTHONUNBUFFERED": "1"},
+        env=os.environ | {"PYTHONPATH": os.getcwd(), "PYTHONUNBUFFERED": "1"} | (variables or {}),
         **options,
     )
 

@@ -2,6 +2,7 @@
 
 import json
 import signal
+import socket
 import time
 
 import pytest
@@ -61,3 +62,40 @@ def test_it_trains_evaluates_and_goes_on_after_kill_and_term(ithor, tmp_path, ca
     results = json.loads((out / "results.json").read_text())
     assert results["split"] == "14/8"
     assert results["seen"]["L>=1"]["n"] == results["unseen"]["L>=1"]["n"] == 1000
+
+
+def test_two_processes_train_together_and_one_goes_on_alone(ithor, tmp_path):
+    """The environments of one run in two processes; what they saved, one process goes on with."""
+    out = tmp_path / "run"
+    arguments = ["--steps", "2400", "--devices", "2", *command.TINY, "--out", out]
+    port = free_port()
+    both = [
+        command.start(
+            "train_zero_shot",
+            *arguments,
+            variables={
+                "JAX_COORDINATOR_ADDRESS": f"localhost:{port}",
+                "JAX_NUM_PROCESSES": "2",
+                "JAX_PROCESS_ID": str(number),
+            },
+        )
+        for number in (0, 1)
+    ]
+    said = [process.communicate(timeout=240)[0] for process in both]
+    assert [process.returncode for process in both] == [0, 0]
+    assert "wrote" in said[0]
+    assert "steps/s" not in said[1]
+    rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert [row["steps"] for row in rows] == list(range(400, 2401, 400))
+
+    config = json.loads((out / "config.json").read_text()) | {"steps": 3200}
+    (out / "config.json").write_text(json.dumps(config))
+    done = command.run("train_zero_shot", "--resume", out)
+    assert done.returncode == 0, done.stderr
+    assert len((out / "metrics.jsonl").read_text().splitlines()) == 8
+
+
+def free_port():
+    with socket.socket() as listener:
+        listener.bind(("localhost", 0))
+        return listener.getsockname()[1]
