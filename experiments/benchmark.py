@@ -428,7 +428,7 @@ def decision_row(task: Task, count: int, repeats: int) -> Row:
     table = actor_critic.prepare(model, weights, task.words)
     keys = jax.random.split(jax.random.key(1), count)
     obs, _ = jax.vmap(env.reset, (0, None))(keys, task.eval_params)
-    carry, fresh = model.initial_carry(count), jnp.zeros(count, bool)
+    carry, fresh = model.initial_carry(count, weights), jnp.zeros(count, bool)
     previous = jnp.zeros((count, 6))
 
     @jax.jit

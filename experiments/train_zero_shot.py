@@ -119,7 +119,7 @@ def default_folder(config: TrainConfig) -> Path:
 def train(config: TrainConfig, folder: Path, command: Command) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
     from tdanet_jax import devices, episodes, files
-    from tdanet_jax.task import load_task, resolve_precision
+    from tdanet_jax.task import load_task, resolve
     from tdanet_jax.training import Run
 
     with stoppable(lambda: how_to_go_on(folder)) as stop:
@@ -130,7 +130,7 @@ def train(config: TrainConfig, folder: Path, command: Command) -> None:
             task = load_task(config, lambda done, total: report_rooms(done / total, "rebuilt"))
         lists = episodes.load(task.tables, task.split, task.extras)
         # What `auto` means here is part of the run: it goes on with the same products elsewhere.
-        config = dataclasses.replace(config, network=resolve_precision(config.network))
+        config = resolve(config)
         with files.locked(folder) if devices.is_lead() else contextlib.nullcontext():
             if devices.is_lead():
                 prepare(folder, config, task, resume=command.resume is not None)
@@ -263,6 +263,7 @@ def report_on(run: Run, lists: Mapping[str, Episodes]) -> None:
         steps=run.steps,
         data_version=task.tables.data_version,
         data=run.config.data,
+        image=task.image,
     )
     print_summary(report.write(run.folder, provenance, task.tables, played))
     console.print(f"wrote {run.folder / 'results.md'}")

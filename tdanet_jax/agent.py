@@ -99,7 +99,7 @@ class Agent:
 
     def start(self) -> Memory:
         """The memory at the start of an episode."""
-        return Memory(self.model.initial_carry(1), jnp.zeros((1, NUM_ACTIONS)))
+        return Memory(self.model.initial_carry(1, self.weights), jnp.zeros((1, NUM_ACTIONS)))
 
     def act(
         self,

@@ -20,6 +20,10 @@ MODELS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "tdanet-no-ta-sa": ("tdanet_jax.models.tdanet", {"target_attention": False, "siamese": False}),
     "ssnet": ("tdanet_jax.models.ssnet", {}),
     "mjolnir-o": ("tdanet_jax.models.mjolnir", {}),
+    "baseline": ("tdanet_jax.models.baseline", {}),
+    "sp": ("tdanet_jax.models.sp", {"width": 256}),
+    "sp-wide": ("tdanet_jax.models.sp", {"width": 1024}),
+    "savn": ("tdanet_jax.models.savn", {}),
 }
 #: Name of the file in a run's folder that holds its configuration.
 CONFIG_FILE = "config.json"
@@ -80,6 +84,14 @@ class NetworkConfig:
     the code of MJOLNIR and SSNet. Per object did better on validation."""
     word_norm: float = 3.0
     """Length that every word vector is scaled to."""
+    image: Literal["auto", "raster", "features"] = "auto"
+    """What models that look at an image see: the classes of 7 x 7 cells, or the feature maps of
+    ResNet-18 that were imported beside --data. auto: the maps where there are any."""
+    inner_rate: float = 1e-4
+    """Size of the inner gradient steps of the models that adapt."""
+    first_order: bool = False
+    """Trains the models that adapt without the gradient through their inner steps, but for the
+    learned loss."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Operands of the large products; parameters and sums are always float32. auto: bfloat16 where
     the hardware multiplies it faster, on accelerators and on CPUs with AMX."""
@@ -93,8 +105,10 @@ class TrainConfig:
     """Seen/unseen target classes: 22/0, 18/4 or 14/8."""
     model: str = "tdanet"
     """The model to train: tdanet, one of its ablations (tdanet-no-ta without target attention,
-    tdanet-no-sa without the Siamese comparison, tdanet-no-ta-sa without either), ssnet,
-    mjolnir-o, or the dotted name of a module of your own that has a function `make`."""
+    tdanet-no-sa without the Siamese comparison, tdanet-no-ta-sa without either), ssnet, mjolnir-o,
+    baseline (an image and an LSTM), sp (the baseline with scene priors; sp-wide in the published
+    size), savn (the baseline, which goes on learning while it acts), or the dotted name of a module
+    of your own that has a function `make`."""
     steps: int = 12_000_000
     """Budget in environment steps (actions)."""
     episodes: int | None = None
@@ -154,6 +168,7 @@ class TrainConfig:
             "--width": self.network.width,
             "--hidden": self.network.hidden,
             "--word-norm": self.network.word_norm,
+            "--inner-rate": self.network.inner_rate,
         }
         for flag, value in positive.items():
             if value is not None and not value > 0:
@@ -168,6 +183,8 @@ class TrainConfig:
         for flag, value in not_negative.items():
             if value < 0:
                 raise ValueError(f"{flag} {value}: must not be negative")
+        if self.network.image == "features" and self.data is None:
+            raise ValueError("--image features: needs --data, rooms that were imported with them")
         shares = {
             "--gamma": self.learner.gamma,
             "--gae-lambda": self.learner.gae_lambda,

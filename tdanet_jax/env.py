@@ -26,6 +26,8 @@ ROTATIONS = 8
 POSES_PER_POSITION = 16
 #: Rows and columns of the class raster, the size of a ResNet-18 feature map.
 RASTER = (7, 7)
+#: Cells and channels of a ResNet-18 feature map.
+FEATURES = (49, 512)
 #: Steps after which a test episode ends, by room type (Du et al. 2020 and its successors).
 TEST_STEP_LIMITS = (100, 200, 100, 100)
 
@@ -52,6 +54,8 @@ class EnvParams(struct.PyTreeNode):
     start_position: jax.Array  # [sum] int32, positions from which the pair's target can be reached
     similarity: jax.Array | None  # [S, G] float32, largest cosine in view, if it is paid for
     raster: jax.Array | None  # [S, 7, 7] int8, class of each image cell, -1 none; if anyone looks
+    features: jax.Array | None  # [S', 49, 512] float16, ResNet-18's maps of imported rooms; or none
+    first_feature: jax.Array | None  # [P] int32, row of a position's first pose in `features`
     max_detections: int = struct.field(pytree_node=False)  # K, most detections in any pose
 
 
@@ -75,6 +79,7 @@ class Observation(struct.PyTreeNode):
     target: jax.Array  # int32, class of the target
     empty: jax.Array  # bool, no detection at all
     cells: jax.Array | None = None  # [7, 7] int32, class of each image cell, -1 none; if asked for
+    features: jax.Array | None = None  # [49, 512] float16, ResNet-18's map of an imported image
 
 
 class Outcome(NamedTuple):
@@ -95,6 +100,7 @@ def make_params(
     merge: bool,
     image: bool = False,
     similarity: np.ndarray | None = None,
+    features: tuple[jax.Array, np.ndarray] | None = None,
 ) -> EnvParams:
     """Puts scene tables into the arrays that the environment reads.
 
@@ -107,6 +113,8 @@ def make_params(
       image: observations hold the class raster, too.
       similarity: [S, G], largest cosine between the target and a class in view; given, it is paid
         for in place of parents.
+      features: ResNet-18's maps of all poses of some rooms, [S', 49, 512], and for each position of
+        these tables the row of its first pose there; observations then hold the map, too.
 
     Raises:
       ValueError: no episode is possible.
@@ -130,6 +138,8 @@ def make_params(
         max_detections=longest,
         similarity=None if similarity is None else jnp.asarray(similarity, jnp.float32),
         raster=jnp.asarray(tables.raster, jnp.int8) if image else None,
+        features=None if features is None else features[0],
+        first_feature=None if features is None else jnp.asarray(features[1], jnp.int32),
         **{name: jnp.asarray(v, jnp.int32) for name, v in _episode_pool(tables, targets).items()},
     )
 
@@ -254,6 +264,10 @@ def observe(state: EnvState, params: EnvParams) -> Observation:
     slots = jnp.arange(params.max_detections, dtype=jnp.int32)
     mask = slots < last - first
     rows = first + slots
+    features = None
+    if params.features is not None and params.first_feature is not None:
+        position, pose = state.pose // POSES_PER_POSITION, state.pose % POSES_PER_POSITION
+        features = params.features[params.first_feature[position] + pose]
     return Observation(
         classes=jnp.where(mask, params.row_class[rows], 0),
         boxes=jnp.where(mask[:, None], params.row_box[rows], 0.0),
@@ -261,6 +275,7 @@ def observe(state: EnvState, params: EnvParams) -> Observation:
         target=params.target_class[state.target],
         empty=last == first,
         cells=None if params.raster is None else params.raster[state.pose].astype(jnp.int32),
+        features=features,
     )
 
 

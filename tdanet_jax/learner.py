@@ -36,7 +36,7 @@ class TrainState(struct.PyTreeNode):
     opt_state: optax.OptState
     env_state: EnvState  # [B]
     held: jax.Array  # [B] bool, the episode was truncated and waits to be valued
-    carry: Carry  # each [B, H]
+    carry: Any  # recurrent state, a batch of B
     previous: jax.Array  # [B, 6], action probabilities of the step before
     fresh: jax.Array  # [B] bool, the episode has just begun
     key: jax.Array  # the run's key; every update folds its number into it
@@ -85,7 +85,7 @@ def init(
         opt_state=make_optimizer(config).init(weights),
         env_state=_reset(env_key, params, batch),
         held=jnp.zeros(batch, bool),
-        carry=model.initial_carry(batch),
+        carry=model.initial_carry(batch, weights, training=True),
         previous=jnp.zeros((batch, NUM_ACTIONS)),
         fresh=jnp.ones(batch, bool),
         key=run_key,
@@ -162,6 +162,7 @@ def rollout(
         )
         return following_state, step
 
+    state = state.replace(carry=model.begin_rollout(state.carry))
     after, steps = jax.lax.scan(act, state, jax.random.split(key, config.rollout_steps))
     obs = observe(after.env_state, params)
     _, out = actor_critic.forward(

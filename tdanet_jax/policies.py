@@ -61,7 +61,7 @@ def network(model: ActorCritic, words: jax.Array, greedy: bool = False) -> Polic
     def start(weights: Any, batch: int) -> Any:
         table = actor_critic.prepare(model, weights, words)
         previous, fresh = jnp.zeros((batch, NUM_ACTIONS)), jnp.ones(batch, bool)
-        return table, model.initial_carry(batch), previous, fresh
+        return table, model.initial_carry(batch, weights), previous, fresh
 
     def act(
         weights: Any, memory: Any, key: jax.Array, state: EnvState, params: EnvParams

@@ -41,6 +41,7 @@ class Provenance:
     steps: int
     data_version: str
     data: str | None = None
+    image: str | None = None
 
 
 def columns(tables: SceneTables, episodes: Episodes, records: Records) -> dict[str, np.ndarray]:
@@ -138,7 +139,9 @@ def write(
     out = results(provenance, groups)
     with files.replacing(folder / "episodes.jsonl") as fresh, fresh.open("w") as file:
         file.writelines(json.dumps(row) + "\n" for row in all_rows(tables, played))
-    files.write_text(folder / "results.md", markdown(out, groups, provenance.data))
+    files.write_text(
+        folder / "results.md", markdown(out, groups, provenance.data, provenance.image)
+    )
     # The last file, and whole: where it is, the others are.
     files.write_text(folder / "results.json", json.dumps(out, indent=2) + "\n")
     return out
@@ -156,17 +159,20 @@ def markdown(
     out: Mapping[str, Any],
     groups: Mapping[str, Mapping[str, np.ndarray]],
     data: str | None = None,
+    image: str | None = None,
 ) -> str:
     """`results.md`: the tables of the paper's form, with the paper's rows beside ours.
 
     Args:
       data: file of the rooms, where they are not the bundled ones.
+      image: what the model sees, if it looks at an image.
     """
     lines = [
         f"# {out['model']}, split {out['split']}, seed {out['seed']}",
         "",
         f"{out['episodes_trained']:,} training episodes, {out['steps']:,} environment steps; "
         f"{out['policy']} actions; scene tables {out['data_version']}, code {out['commit']}.",
+        *([] if image is None else [f"Image: {image}."]),
         "",
         "SR and SPL in percent, with 95 % bootstrap intervals over (room, target) pairs.",
         "",

@@ -169,4 +169,5 @@ def _provenance(network: Saved, snapshot: Snapshot, task: Task, greedy: bool) ->
         steps=snapshot.updates * network.config.steps_per_update,
         data_version=task.tables.data_version,
         data=network.config.data,
+        image=task.image,
     )

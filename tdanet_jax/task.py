@@ -8,12 +8,13 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from tdanet_jax import env, graph, zero_shot
 from tdanet_jax import words as word_vectors
 from tdanet_jax.classes import Classes, make_classes
 from tdanet_jax.config import MODELS, NetworkConfig, TrainConfig
-from tdanet_jax.env import TEST_STEP_LIMITS, EnvParams
+from tdanet_jax.env import POSES_PER_POSITION, TEST_STEP_LIMITS, EnvParams
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.reward import (
     Parents,
@@ -24,6 +25,7 @@ from tdanet_jax.reward import (
     published_parents,
 )
 from tdanet_jax.scenes.dataset import Extras, load_rooms
+from tdanet_jax.scenes.offline import importer
 from tdanet_jax.scenes.tables import Progress, SceneTables
 from tdanet_jax.vocabulary import ROOM_TYPES, Split, make_split
 from tdanet_jax.words import WordVectors
@@ -55,6 +57,14 @@ class Task:
     words: jax.Array
     extras: Extras | None = None
 
+    @property
+    def image(self) -> str | None:
+        """What the model sees in words, if it looks at an image."""
+        if not self.model.encoder.IMAGE:
+            return None
+        maps = "ResNet-18's feature map of the frame"
+        return maps if self.model.encoder.maps else "the class in each of 7 x 7 cells of the frame"
+
 
 def load_task(config: TrainConfig, progress: Progress | None = None) -> Task:
     """The task of a configuration on the rooms and with the word vectors that it names.
@@ -67,8 +77,11 @@ def load_task(config: TrainConfig, progress: Progress | None = None) -> Task:
     """
     rooms = load_rooms(config.data, progress)
     vectors = word_vectors.load(config.word_vectors, rooms.tables.classes)
+    config, features = resolve(config), None
+    if config.data is not None and config.network.image == "features":
+        features = importer.load_features(Path(config.data), rooms.tables)
     try:
-        return make_task(config, rooms.tables, vectors, rooms.extras)
+        return make_task(config, rooms.tables, vectors, rooms.extras, features)
     except ValueError as error:
         if config.data is None:
             raise
@@ -76,7 +89,11 @@ def load_task(config: TrainConfig, progress: Progress | None = None) -> Task:
 
 
 def make_task(
-    config: TrainConfig, tables: SceneTables, vectors: WordVectors, extras: Extras | None = None
+    config: TrainConfig,
+    tables: SceneTables,
+    vectors: WordVectors,
+    extras: Extras | None = None,
+    features: np.ndarray | None = None,
 ) -> Task:
     """The task of a configuration on the given rooms; the split is what they hold of it.
 
@@ -86,6 +103,8 @@ def make_task(
       vectors: the word vectors.
       extras: what came with imported rooms. Their parents and class graph, where there are any,
         replace those found in the training rooms. Hidden classes are in neither.
+      features: [S, 512, 7, 7], ResNet-18's maps of all poses, for the models that look at an image.
+        Pictures show hidden classes, too: nothing can be filtered out of them.
 
     Raises:
       ValueError: the rooms hold none to train or to evaluate in, or a class has no word vector.
@@ -98,6 +117,8 @@ def make_task(
     classes = make_classes(tables.classes, split.hidden, adjacency)
     model = make_model(config, classes)
     shown = (model.encoder.ROWS or config.network.rows) == "class", model.encoder.IMAGE
+    maps = _feature_maps(features) if features is not None and model.encoder.maps else None
+    trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]
     parents = _parents(seen_rooms, split, extras)
     paid = config.learner.partial_reward
     limits = [config.learner.step_limit] * len(ROOM_TYPES)
@@ -116,12 +137,31 @@ def make_task(
             limits,
             *shown,
             greatest_similarity(seen_rooms, cosines(train_words)) if paid == "similarity" else None,
+            _places(maps, trains),
         ),
-        eval_params=env.make_params(tables, targets, parents, TEST_STEP_LIMITS, *shown),
+        eval_params=env.make_params(
+            tables,
+            targets,
+            parents,
+            TEST_STEP_LIMITS,
+            *shown,
+            features=_places(maps, trains | True),
+        ),
         train_words=jnp.asarray(train_words),
         words=jnp.asarray(words),
         extras=extras,
     )
+
+
+def _feature_maps(features: np.ndarray) -> jax.Array:
+    """[S, 512, 7, 7] -> [S, 49, 512], cells before channels."""
+    flat = features.reshape(*features.shape[:2], -1)
+    return jnp.asarray(np.ascontiguousarray(flat.swapaxes(1, 2)))
+
+
+def _places(maps: jax.Array | None, chosen: np.ndarray) -> tuple[jax.Array, np.ndarray] | None:
+    """The maps, and where among them the chosen positions [P] begin: nothing is copied."""
+    return None if maps is None else (maps, POSES_PER_POSITION * np.flatnonzero(chosen))
 
 
 def _parents(seen_rooms: SceneTables, split: Split, extras: Extras | None) -> Parents:
@@ -129,6 +169,15 @@ def _parents(seen_rooms: SceneTables, split: Split, extras: Extras | None) -> Pa
     if extras is not None and extras.parents:
         return published_parents(seen_rooms, split.seen, extras.parents, split.hidden)
     return find_parents(seen_rooms, split.seen)
+
+
+def resolve(config: TrainConfig) -> TrainConfig:
+    """The configuration with every `auto` replaced by what suits this machine and the data."""
+    network = resolve_precision(config.network)
+    if network.image == "auto":
+        imported = config.data is not None and importer.features_path(Path(config.data)).is_file()
+        network = dataclasses.replace(network, image="features" if imported else "raster")
+    return dataclasses.replace(config, network=network)
 
 
 def resolve_precision(config: NetworkConfig) -> NetworkConfig:

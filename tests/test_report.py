@@ -52,6 +52,12 @@ def test_results_have_the_documented_shape(written):
     assert out["by_target"] == {"Mug": {"seen": out["seen"]}}
 
 
+def test_the_report_says_what_image_a_model_saw(played, ithor, tmp_path):
+    shown = report.Provenance("18/4", "savn", "sample", 1, 0, 2, ithor.data_version, image="a map")
+    report.write(tmp_path, shown, ithor, played)
+    assert "Image: a map." in (tmp_path / "results.md").read_text()
+
+
 def test_percentages_run_from_0_to_100_and_an_empty_bucket_is_null(written):
     _, out = written
     assert out["seen"]["L>=1"]["SR"] == pytest.approx(100 / 3, abs=0.01)

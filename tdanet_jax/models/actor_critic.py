@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from tdanet_jax.env import RASTER, Observation
+from tdanet_jax.env import FEATURES, RASTER, Observation
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import LSTM, TAPE, Carry, Linear
 from tdanet_jax.vocabulary import NUM_ACTIONS
@@ -67,37 +67,62 @@ class ActorCritic(nn.Module):
           fresh: [...] bool, True where an episode starts.
           keep: [..., units] bool, units that dropout keeps; None when not training.
         """
+        features, aside = self.perceive(table, obs, previous, keep)
+        carry, hidden = self.lstm(carry, features, aside, fresh)
+        return carry, self.decide(hidden)
+
+    def perceive(
+        self, table: Any, obs: Observation, previous: jax.Array, keep: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array]:
+        """The inputs of the LSTM: features [..., n], and the few `aside` [..., m]."""
         action = previous
         if self.encoder.ACTION != "plain":
             action = nn.relu(self.action_embedding(previous))
         features = self.encoder(table, obs, action, keep)
-        aside = action[..., :0] if self.encoder.ACTION == "inside" else action
-        carry, hidden = self.lstm(carry, features, aside, fresh)
-        return carry, Output(self.actor(hidden), self.critic(hidden)[..., 0])
+        return features, action[..., :0] if self.encoder.ACTION == "inside" else action
+
+    def decide(self, hidden: jax.Array) -> Output:
+        """Policy and value, from hidden states [..., H]."""
+        return Output(self.actor(hidden), self.critic(hidden)[..., 0])
 
     def attention(self, table: Any, obs: Observation) -> jax.Array | None:
         """The encoder's weights over the detections, [..., K]; None if it has none."""
         return self.encoder.attend(table, obs)
 
-    def initial_carry(self, batch: int) -> Carry:
-        """The recurrent state at the start of an episode: zeros."""
+    def initial_carry(self, batch: int, weights: Any = None, training: bool = False) -> Any:
+        """The recurrent state at the start of an episode: zeros.
+
+        Args:
+          batch: B.
+          weights: the parameters; only networks that adapt need them.
+          training: whether units will be dropped.
+        """
         return jnp.zeros((batch, self.hidden)), jnp.zeros((batch, self.hidden))
+
+    def begin_rollout(self, carry: Any) -> Any:
+        """The recurrent state that a rollout begins with, from that behind the one before."""
+        return carry
+
+    def blank(self, batch: int) -> Observation:
+        """Observations of nothing."""
+        return Observation(
+            classes=jnp.zeros((batch, 1), jnp.int32),
+            boxes=jnp.zeros((batch, 1, 3)),
+            mask=jnp.zeros((batch, 1), bool),
+            target=jnp.zeros(batch, jnp.int32),
+            empty=jnp.ones(batch, bool),
+            cells=jnp.full((batch, *RASTER), -1, jnp.int32) if self.encoder.IMAGE else None,
+            features=jnp.zeros((batch, *FEATURES), jnp.float16) if self.encoder.maps else None,
+        )
 
     def initialise(self, key: jax.Array, words: jax.Array) -> Any:
         """Fresh parameters for word vectors [C, D]."""
 
         def everything(module: ActorCritic) -> Output:
-            blank = Observation(
-                classes=jnp.zeros((1, 1), jnp.int32),
-                boxes=jnp.zeros((1, 1, 3)),
-                mask=jnp.zeros((1, 1), bool),
-                target=jnp.zeros((1,), jnp.int32),
-                empty=jnp.ones((1,), bool),
-                cells=jnp.full((1, *RASTER), -1, jnp.int32) if self.encoder.IMAGE else None,
-            )
             previous, fresh = jnp.zeros((1, NUM_ACTIONS)), jnp.ones((1,), bool)
             table = module.prepare(words)
-            return module(table, module.initial_carry(1), blank, previous, fresh)[1]
+            carry = jnp.zeros((1, module.hidden)), jnp.zeros((1, module.hidden))
+            return module(table, carry, module.blank(1), previous, fresh)[1]
 
         return nn.init(everything, self)(key)["params"]
 
@@ -137,4 +162,4 @@ def record(
     """`forward` of one step, and the tape that it recorded."""
     arguments = (table, carry, obs, previous, fresh, keep)
     (after, out), variables = model.apply({"params": weights}, *arguments, mutable=[TAPE])
-    return after, out, variables[TAPE]
+    return after, out, variables.get(TAPE, {})

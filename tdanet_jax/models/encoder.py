@@ -20,15 +20,17 @@ class Encoder(nn.Module, kw_only=True):
 
     Attributes:
       dropout: share of units that is dropped in training.
+      maps: its image is ResNet-18's feature map, `Observation.features`, and not the raster.
       ROWS: the detections that it is made for: one row per "class", or None where the
         configuration decides.
-      IMAGE: whether it looks at `Observation.cells`.
+      IMAGE: whether it looks at an image.
       ACTION: how the previous step's action probabilities enter. "embedded": through a layer of
         ten units, into the LSTM. "plain": as they are, into the LSTM. "inside": through the same
         layer, into the encoder alone.
     """
 
     dropout: float = 0.0
+    maps: bool = False
 
     ROWS: ClassVar[Literal["class"] | None] = None
     IMAGE: ClassVar[bool] = False
@@ -61,6 +63,14 @@ class Encoder(nn.Module, kw_only=True):
 
         Returns:
           [..., H] float32.
+        """
+        raise NotImplementedError
+
+    def view(self, obs: Observation) -> Observation:
+        """What of the observations the encoder uses, in shapes that are the same for all frames.
+
+        It says the same of them as of the observations themselves. Only networks that remember
+        frames ask for it (`tdanet_jax.models.adaptation`).
         """
         raise NotImplementedError
 

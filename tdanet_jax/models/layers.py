@@ -18,6 +18,10 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 TAPE = "tape"
+#: The Flax collection of what each environment adds to the parameters of the dense layers: arrays
+#: of the parameters' names and shapes, with a leading axis B; and perhaps `gate` [B] bool, where
+#: they count.
+OWN = "own"
 
 #: A recurrent state: hidden and cell, each [B, H] float32.
 Carry = tuple[jax.Array, jax.Array]
@@ -94,6 +98,34 @@ def _product_bwd(dtype: Any, saved: tuple, cotangent: jax.Array) -> tuple[jax.Ar
 
 
 product.defvjp(_product_fwd, _product_bwd)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
+def paired_product(x: jax.Array, kernel: jax.Array, transposed: jax.Array, dtype: Any) -> jax.Array:
+    """`product(x, kernel, dtype)` for x [B, n], whose backward pass reads arrays that lie ready.
+
+    Args:
+      x: [B, n].
+      kernel: [n, m].
+      transposed: [m, n], `kernel.T`; gets no gradient.
+      dtype: of the operands.
+    """
+    return _dot(x, kernel, dtype)
+
+
+def _paired_product_fwd(
+    x: jax.Array, kernel: jax.Array, transposed: jax.Array, dtype: Any
+) -> tuple[jax.Array, tuple]:
+    kept = _pack(x.astype(dtype).T) if _keeps_transposed(dtype) else x.T
+    return paired_product(x, kernel, transposed, dtype), (kept, transposed)
+
+
+def _paired_product_bwd(dtype: Any, saved: tuple, cotangent: jax.Array) -> tuple:
+    kept, transposed = saved
+    return _dot(cotangent, transposed, dtype), _dot(_unpack(kept), cotangent, dtype), None
+
+
+paired_product.defvjp(_paired_product_fwd, _paired_product_bwd)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
@@ -188,17 +220,20 @@ recall.defvjp(_recall_fwd, _recall_bwd)
 
 
 class Linear(nn.Module):
-    """A dense layer with bias that can record its product on the tape, or take it from there."""
+    """A dense layer that can record its product on the tape, or take it from there."""
 
     features: int
     dtype: Any = jnp.float32  # of the operands; parameters and results are float32
     kernel_init: Any = nn.initializers.lecun_normal()
+    use_bias: bool = True
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """[..., n] -> [..., features]."""
         kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
-        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        bias: Any = 0.0
+        if self.use_bias:
+            bias = self.param("bias", nn.initializers.zeros, (self.features,))
         # One row per environment is recorded; products over more than that are taken again.
         records = self.is_mutable_collection(TAPE) and x.ndim == 2
         if self.has_variable(TAPE, "product") and not self.is_mutable_collection(TAPE):
@@ -208,7 +243,25 @@ class Linear(nn.Module):
             kept = _keeps_transposed(self.dtype)
             transposed = _pack(x.astype(self.dtype).T) if kept else None
             self.put_variable(TAPE, "product", (y, transposed))
-        return y + bias
+        return y + bias + self.own(x)
+
+    @property
+    def adapted(self) -> bool:
+        """Whether each environment adds a part of its own."""
+        return self.has_variable(OWN, "kernel")
+
+    def own(self, x: jax.Array) -> jax.Array | float:
+        """What each environment's own part of the parameters adds: [B, ..., n] -> [B, ..., m]."""
+        if not self.adapted:
+            return 0.0
+        y = jnp.einsum("b...n,bnm->b...m", x, self.get_variable(OWN, "kernel"))
+        if self.use_bias:
+            bias: Any = self.get_variable(OWN, "bias")
+            y += bias.reshape(len(bias), *(1,) * (y.ndim - 2), -1)
+        if self.has_variable(OWN, "gate"):
+            gate: Any = self.get_variable(OWN, "gate")
+            y = jnp.where(gate.reshape(-1, *(1,) * (y.ndim - 1)), y, 0.0)
+        return y
 
 
 class LSTM(nn.Module):
@@ -243,7 +296,9 @@ class LSTM(nn.Module):
 
         gates = 4 * self.features
         kernel = self.param("kernel", uniform, (x.shape[-1] + self.features, gates))
-        kernel_aside = self.param("kernel_aside", uniform, (aside.shape[-1], gates))
+        kernel_aside = jnp.zeros((0, gates))
+        if aside.shape[-1]:  # a checkpoint takes no empty array
+            kernel_aside = self.param("kernel_aside", uniform, (aside.shape[-1], gates))
         # Two biases, as in the published counts; they act as their sum.
         bias = self.param("bias_ih", nn.initializers.zeros, (gates,))
         bias = bias + self.param("bias_hh", nn.initializers.zeros, (gates,))
@@ -275,7 +330,7 @@ Weights = tuple[jax.Array, jax.Array, jax.Array]
 Memory = tuple[jax.Array, jax.Array, jax.Array]
 
 
-def _clear(carry: Carry, fresh: jax.Array) -> Carry:
+def clear(carry: Carry, fresh: jax.Array) -> Carry:
     """The carry, zero where an episode starts."""
     hidden, cell = carry
     keep = ~fresh[..., None]
@@ -301,14 +356,19 @@ def lstm_step(
       dtype: of the large product's operands.
     """
     kernel, kernel_aside, bias = weights
-    hidden, cell = _clear(carry, fresh)
+    hidden, cell = clear(carry, fresh)
     inputs = jnp.concatenate([x.astype(dtype), hidden.astype(dtype)], axis=-1)
     z = product(inputs, kernel, dtype) + (product(aside, kernel_aside, jnp.float32) + bias)
+    after, gates = lstm_cell(z, cell)
+    return after, (gates, after[1], _pack(inputs.T))
+
+
+def lstm_cell(z: jax.Array, cell: jax.Array) -> tuple[Carry, jax.Array]:
+    """The carry behind a step, and its gates [..., 4 H], from the gates' inputs and the cell."""
     i, f, g, o = jnp.split(z, 4, axis=-1)
     i, f, g, o = jax.nn.sigmoid(i), jax.nn.sigmoid(f), jnp.tanh(g), jax.nn.sigmoid(o)
     cell = f * cell + i * g
-    memory = jnp.concatenate([i, f, g, o], axis=-1), cell, _pack(inputs.T)
-    return (o * jnp.tanh(cell), cell), memory
+    return (o * jnp.tanh(cell), cell), jnp.concatenate([i, f, g, o], axis=-1)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(5,))
@@ -364,7 +424,7 @@ def _recall_lstm_bwd(dtype: Any, saved: tuple, cotangents: Carry) -> tuple:
         )
         rounded = grad_z.astype(dtype)
         grad_inputs = _dot(rounded, back, dtype)
-        earlier = _clear((grad_inputs[:, split:], grad_cell * f), fresh_t)
+        earlier = clear((grad_inputs[:, split:], grad_cell * f), fresh_t)
         grad_weights = (
             grad_kernel + _dot(_unpack(inputs_t), rounded, dtype),
             grad_aside + aside_t.T @ grad_z,

@@ -76,12 +76,69 @@ def encode(
     return relu(xp, linear(params["linear4"], hidden))
 
 
+def image(
+    xp: Any,
+    params: Params,
+    cells: Array,
+    words: Array,
+    target: int,
+    action: Array,
+    kept: Array | None = None,
+    dropout: float = 0.25,
+    maps: Array | None = None,
+) -> Array:
+    """Features [3136] of the image trunk for one frame, cell by cell.
+
+    Args:
+      cells: [7, 7], class of each cell, -1 none.
+      words: [C, D].
+      target: class of the target.
+      action: [10], embedding of the previous action probabilities.
+      kept: [2, 49, 64] bool, units that dropout keeps behind each convolution.
+      maps: [49, 512], ResNet-18's feature map, in place of the raster.
+    """
+
+    def drop(x: Array, layer: int, cell: int) -> Array:
+        return x if kept is None else xp.where(kept[layer, cell], x / (1 - dropout), 0.0)
+
+    embedded = relu(xp, linear(params["target"], words[target]))
+    second = xp.concatenate([params["pointwise"]["kernel"], params["context"]["kernel"]])
+    out = []
+    for i, cls in enumerate(np.asarray(cells).reshape(-1)):
+        cell = words[cls] if cls >= 0 else 0 * words[0]
+        cell = cell if maps is None else maps[i]
+        first = drop(relu(xp, linear(params["convolution"], cell)), 0, i)
+        joined = xp.concatenate([first, embedded, action])  # 138 channels
+        out.append(drop(relu(xp, joined @ second + params["context"]["bias"]), 1, i))
+    return xp.concatenate(out)
+
+
+def scene_priors(
+    xp: Any, params: Params, cells: Array, words: Array, known: tuple[int, ...], adjacency: Array
+) -> Array:
+    """The graph's features of one frame, as in the code of SAVN: relu(A X W) three times.
+
+    Args:
+      cells: [7, 7], class of each cell, -1 none.
+      words: [C, D].
+      known: the n classes that are nodes.
+      adjacency: [n, n], normalised.
+    """
+    seen = xp.array([float((np.asarray(cells) == cls).any()) for cls in known])
+    frame = linear(params["seen"], seen)
+    nodes = xp.stack([xp.concatenate([frame, linear(params["words"], words[c])]) for c in known])
+    parts = [params["convolution_seen"]["kernel"], params["convolution_words"]["kernel"]]
+    for kernel in (xp.concatenate(parts), params["kernel1"], params["kernel2"]):
+        nodes = relu(xp, adjacency @ nodes @ kernel)
+    return linear(params["mapping"], nodes[:, 0])
+
+
 def lstm(
     xp: Any, params: Params, hidden: Array, cell: Array, x: Array, aside: Array
 ) -> tuple[Array, Array]:
     """One step on the inputs [x, aside], with the gates in the order i, f, g, o and two biases."""
     first, last = params["kernel"][: x.shape[-1]], params["kernel"][x.shape[-1] :]
-    kernel = xp.concatenate([first, params["kernel_aside"], last])
+    kernel = xp.concatenate([first, params.get("kernel_aside", last[:0]), last])
     z = xp.concatenate([x, aside, hidden], axis=-1) @ kernel
     z = z + params["bias_ih"] + params["bias_hh"]
     i, f, g, o = xp.split(z, 4, axis=-1)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tdanet_jax.env import RASTER, Observation
+from tdanet_jax.env import FEATURES, RASTER, Observation
 
 CLASSES, WIDTH, DETECTIONS = 9, 5, 6  # C, D, K
 
@@ -32,6 +32,8 @@ def observations(*shape: int, seed: int = 1) -> Observation:
         mask=jnp.asarray(mask),
         target=jnp.asarray(rng.integers(0, CLASSES, shape), jnp.int32),
         empty=jnp.asarray(count == 0),
+        cells=jnp.asarray(rng.integers(-1, CLASSES, (*shape, *RASTER)), jnp.int32),
+        features=jnp.asarray(rng.random((*shape, *FEATURES)), jnp.float16),
     )
 
 

@@ -69,7 +69,7 @@ def test_the_previous_action_enters_where_the_model_says(
 ) -> None:
     previous = jnp.eye(6)[:B]
     weights, first = logits(encoder, previous)
-    assert weights["lstm"]["kernel_aside"].shape == (aside, 24)
+    assert weights["lstm"].get("kernel_aside", jnp.zeros((0, 24))).shape == (aside, 24)
     assert weights["lstm"]["kernel"].shape == (inputs, 24)
     assert ("action_embedding" in weights) == (encoder.ACTION != "plain")
     _, second = logits(encoder, jnp.roll(previous, 1, axis=-1))
@@ -99,13 +99,27 @@ def test_products_over_more_than_one_row_per_environment_get_their_gradient_with
 
 
 @pytest.mark.parametrize("name", MODELS)
+def test_no_array_of_a_model_is_empty(name: str) -> None:
+    # A checkpoint takes none.
+    names = tuple(f"Class{i}" for i in range(samples.CLASSES))
+    model = make_model(dataclasses.replace(SMALL, model=name), Classes(names, tuple(range(7))))
+
+    def state() -> Any:
+        weights = model.initialise(jax.random.key(0), WORDS)
+        return weights, model.initial_carry(B, weights, training=True)
+
+    for path, leaf in jax.tree.leaves_with_path(jax.eval_shape(state)):
+        assert leaf.size, jax.tree_util.keystr(path)
+
+
+@pytest.mark.parametrize("name", MODELS)
 def test_every_named_model_is_made_and_answers(name: str) -> None:
     names = tuple(f"Class{i}" for i in range(samples.CLASSES))
     model = make_model(dataclasses.replace(SMALL, model=name), Classes(names, tuple(range(7))))
     weights = model.initialise(jax.random.key(0), WORDS)
     table = actor_critic.prepare(model, weights, WORDS)
     obs = samples.observations(B)
-    state = model.initial_carry(B), obs, jnp.zeros((B, 6)), jnp.ones(B, bool)
+    state = model.initial_carry(B, weights), obs, jnp.zeros((B, 6)), jnp.ones(B, bool)
     _, out = actor_critic.forward(model, weights, table, *state)
     assert out.logits.shape == (B, 6)
     assert np.isfinite(out.logits).all()

@@ -13,7 +13,7 @@ from flax import linen as nn
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tdanet_jax.models.layers import LSTM, TAPE, Linear, product
+from tdanet_jax.models.layers import LSTM, TAPE, Linear, paired_product, product
 from tests.models import equations
 from tests.models.samples import randomised
 
@@ -42,6 +42,16 @@ def test_product_rounds_its_operands_only() -> None:
     assert rounded.dtype == jnp.float32
     np.testing.assert_allclose(rounded, exact, **CLOSE)
     assert not np.allclose(rounded, x @ kernel, **CLOSE)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+def test_a_paired_product_is_a_product(dtype: Any) -> None:
+    x, kernel, weight = normal(6, 4), normal(4, 3, seed=1), normal(6, 3, seed=2)
+    paired = jax.value_and_grad(
+        lambda x, k: (paired_product(x, k, kernel.T, dtype) * weight).sum(), (0, 1)
+    )
+    plain = jax.value_and_grad(lambda x, k: (product(x, k, dtype) * weight).sum(), (0, 1))
+    chex.assert_trees_all_close(paired(x, kernel), plain(x, kernel), **CLOSE)
 
 
 class Stack(nn.Module):

@@ -1,0 +1,140 @@
+"""Scene priors: the baseline with a graph convolution over classes (Yang et al. 2019).
+
+As in the published code: a node of the class graph is [what the frame shows, the class's word
+vector], the former the same for all nodes; three graph convolutions give one number per node, and a
+linear map of these joins the image's features. What the frame shows are a frozen ResNet's scores of
+1,000 classes; here, which of the known classes the raster holds.
+
+Equal forms, held equal by a test: the part of the first layer that is the same for all nodes is
+taken once per frame, the words' part once per parameter change, and the graph is applied behind a
+layer where that is less work.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from flax import struct
+
+from tdanet_jax import graph
+from tdanet_jax.classes import Classes
+from tdanet_jax.config import NetworkConfig
+from tdanet_jax.env import Observation
+from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.encoder import Encoder
+from tdanet_jax.models.image import DROPOUT_UNITS, ImageTable, ImageTrunk
+from tdanet_jax.models.layers import Linear, product
+
+
+class SceneTable(struct.PyTreeNode):
+    """What is known before any frame is seen."""
+
+    image: ImageTable
+    nodes: jax.Array  # [n, width], the words' part of the first graph convolution
+    node: jax.Array  # [C + 1] int32, node of a class; n where it has none
+
+
+class ScenePriorsEncoder(Encoder):
+    """The image trunk and the class graph.
+
+    Attributes:
+      known: the n classes that are nodes.
+      adjacency: [n, n] as nested tuples, normalised.
+      features: units of either part of a node's input, and of the graph's output.
+      width: units of a node's hidden layers.
+      dropout: share of units that is dropped in training, in the image trunk.
+      dtype: operands of the large products.
+    """
+
+    known: tuple[int, ...]
+    adjacency: tuple[tuple[float, ...], ...]
+    features: int = 512
+    width: int = 1024
+    dtype: Any = jnp.float32
+
+    IMAGE = True
+    ACTION = "inside"
+
+    @property
+    def dropout_units(self) -> int:
+        """The units of the trunk."""
+        return DROPOUT_UNITS
+
+    def setup(self) -> None:
+        init = nn.initializers.he_uniform()
+        self.trunk = ImageTrunk(self.maps, self.dropout, self.dtype)
+        self.seen = Linear(self.features)
+        self.words = Linear(self.features)
+        self.convolution_seen = Linear(self.width, kernel_init=init, use_bias=False)
+        self.convolution_words = Linear(self.width, kernel_init=init, use_bias=False)
+        self.kernel1 = self.param("kernel1", init, (self.width, self.width))
+        # Not negative at first: its inputs are not either, so that the sign of their sum, and with
+        # it whether the last ReLU lets anything through, would be an accident of the seed.
+        self.kernel2 = self.param("kernel2", lambda *given: abs(init(*given)), (self.width, 1))
+        self.mapping = Linear(self.features)
+
+    def prepare(self, words: jax.Array) -> SceneTable:
+        """The trunk's table and the nodes' words, from word vectors [C, D]."""
+        known = np.array(self.known)
+        nodes = self.convolution_words(jnp.asarray(self.adjacency) @ self.words(words[known]))
+        node = jnp.full(len(words) + 1, len(known)).at[known].set(jnp.arange(len(known)))
+        return SceneTable(self.trunk.prepare(words), nodes, node)
+
+    def __call__(
+        self, table: SceneTable, obs: Observation, action: jax.Array, keep: jax.Array | None = None
+    ) -> jax.Array:
+        """The features of a batch of observations, [..., 3136 + features]."""
+        assert obs.cells is not None
+        image = self.trunk(table.image, obs, action, keep)
+        cells = table.node[obs.cells].reshape(*obs.cells.shape[:-2], -1)  # -1: no class, no node
+        seen = (cells[..., None] == jnp.arange(len(self.known))).any(axis=-2)
+        frame = self.convolution_seen(self.seen(seen.astype(jnp.float32)))  # [..., width]
+        weights = jnp.asarray(self.adjacency), table.nodes, self.kernel1, self.kernel2
+        if frame.ndim == 2:
+            scores = propagate(weights, frame, self.dtype)
+        else:
+            # One step at a time, and again in the backward pass: the nodes' layers of a whole
+            # rollout would fill the memory.
+            step = jax.checkpoint(lambda frame: propagate(weights, frame, self.dtype))
+            scores = jax.lax.map(step, frame)
+        return jnp.concatenate([image, self.mapping(scores)], axis=-1)
+
+
+def propagate(weights: tuple[jax.Array, ...], frame: jax.Array, dtype: Any) -> jax.Array:
+    """The graph convolutions: relu(A X W) three times.
+
+    Args:
+      weights: A [n, n]; the first layer's A X W as far as it comes from words [n, width]; the
+        kernels of the second and third layer.
+      frame: [B, width], the first layer's X W as far as it comes from the frame.
+      dtype: operands of the large products.
+
+    Returns:
+      [B, n], a number per node.
+    """
+    adjacency, nodes, kernel1, kernel2 = weights
+    count, batch = adjacency.shape[0], frame.shape[0]
+    degree = adjacency.sum(axis=1)[:, None, None]
+    first = nn.relu(degree * frame + nodes[:, None])  # [n, B, width]
+    mixed = product(adjacency, first.reshape(count, -1), dtype).reshape(first.shape)
+    second = nn.relu(product(mixed, kernel1, dtype))
+    last = nn.relu(adjacency @ product(second, kernel2, jnp.float32).reshape(count, batch))
+    return last.T
+
+
+def make(config: NetworkConfig, classes: Classes, dtype: Any, width: int = 1024) -> ActorCritic:
+    """Scene priors, with `width` units in a node's hidden layers."""
+    encoder = ScenePriorsEncoder(
+        known=classes.known,
+        adjacency=tuple(map(tuple, graph.normalised(classes).tolist())),
+        features=config.width,
+        width=width,
+        dropout=config.dropout,
+        maps=config.image == "features",
+        dtype=dtype,
+    )
+    return ActorCritic(encoder, hidden=config.hidden, dtype=dtype)

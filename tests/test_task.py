@@ -1,0 +1,81 @@
+"""Feature maps of imported rooms, from the file to the observation; what `auto` stands for."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tdanet_jax import env
+from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.scenes.offline import importer
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.task import make_task, resolve
+from tdanet_jax.words import WordVectors
+
+SMALL = NetworkConfig(width=8, hidden=4, precision="float32")
+
+
+def rooms(tables: SceneTables) -> SceneTables:
+    """A room that trains, one that tests, and another that trains."""
+    return tables.subset(("FloorPlan7", "FloorPlan29", "FloorPlan204"))
+
+
+def test_each_pose_has_its_own_feature_map_in_training_and_in_tests(
+    ithor: SceneTables, glove: WordVectors
+) -> None:
+    tables = rooms(ithor)
+    states = tables.num_states
+    code = np.arange(states, dtype=np.float64) % 2048  # exact in float16
+    cells = np.arange(49.0).reshape(7, 7)
+    # One channel tells the states apart, the other the cells; two do for 512.
+    marked = np.stack(
+        [
+            np.broadcast_to(code[:, None, None], (states, 7, 7)),
+            np.broadcast_to(cells, (states, 7, 7)),
+        ],
+        axis=1,
+    ).astype(np.float16)
+    network = dataclasses.replace(SMALL, image="features")
+    config = TrainConfig(model="baseline", network=network)
+    task = make_task(config, tables, glove, features=marked)
+    assert task.model.encoder.maps
+    assert task.image is not None
+    assert "ResNet" in task.image
+    shown = ((task.train_params, task.split.train_scenes), (task.eval_params, tables.scenes))
+    for params, scenes in shown:
+        chosen = np.isin(np.array(tables.scenes), scenes)[tables.position_scene]
+        position = np.flatnonzero(chosen)
+        poses = jnp.arange(16 * len(position), dtype=jnp.int32)
+        state = jax.vmap(env.start, (None, 0, None))(params, poses, jnp.int32(0))
+        seen = np.asarray(jax.vmap(env.observe, (0, None))(state, params).features)
+        assert seen.shape == (len(poses), 49, 2)
+        expected = (16 * position[:, None] + np.arange(16)).reshape(-1) % 2048
+        np.testing.assert_array_equal(seen[:, :, 0], np.repeat(expected[:, None], 49, 1))
+        np.testing.assert_array_equal(seen[0, :, 1], np.arange(49))
+
+
+def test_models_without_an_image_are_shown_none(ithor: SceneTables, glove: WordVectors) -> None:
+    task = make_task(TrainConfig(network=SMALL), rooms(ithor), glove)
+    assert task.image is None
+    assert task.train_params.features is None
+
+
+def test_auto_takes_the_feature_maps_that_lie_beside_the_data(tmp_path) -> None:
+    data = tmp_path / "mine.npz"
+    config = TrainConfig(model="baseline", network=SMALL, data=str(data))
+    assert resolve(config).network.image == "raster"
+    importer.features_path(data).write_bytes(b"maps")
+    assert resolve(config).network.image == "features"
+    assert resolve(TrainConfig(network=SMALL)).network.image == "raster"
+    chosen = dataclasses.replace(SMALL, image="raster")
+    assert resolve(dataclasses.replace(config, network=chosen)).network.image == "raster"
+
+
+def test_feature_maps_need_imported_rooms() -> None:
+    network = dataclasses.replace(SMALL, image="features")
+    with pytest.raises(ValueError, match="--image features: needs --data"):
+        TrainConfig(network=network).check()
