@@ -11,14 +11,13 @@ from tdanet_jax.models.baseline import BaselineEncoder
 
 
 def make(config: NetworkConfig, classes: Classes, dtype: Any) -> AdaptiveActorCritic:
-    """SAVN."""
-    # The encoder's products are small, and batched by step where its gradient is taken: XLA's CPU
-    # backend does not take all such products in bfloat16. The LSTM's are in `dtype`.
-    encoder = BaselineEncoder(dropout=config.dropout, maps=config.image == "features")
+    """SAVN. It multiplies in float32, whatever `dtype` says.
+
+    At some sizes XLA's CPU backend compiles its bfloat16 products and then refuses to run them.
+    """
     return AdaptiveActorCritic(
-        encoder,
+        BaselineEncoder(dropout=config.dropout, maps=config.image == "features"),
         hidden=config.hidden,
-        dtype=dtype,
         rate=config.inner_rate,
         first_order=config.first_order,
     )
