@@ -11,8 +11,14 @@ from tdanet_jax.scenes import floor_plan
 from tdanet_jax.scenes.floor_plan import FloorPlan
 from tdanet_jax.trace import View
 
-#: Mean advance of a letter and height of a line, in units of the font's size; on the wide side.
-LETTER, LINE = 0.63, 1.15
+#: Height of a line and advance of a letter, in units of the font's size; on the wide side, as the
+#: reader's font is not known.
+LINE, LETTER = 1.15, 0.7
+_ADVANCE = {
+    **dict.fromkeys("ijlI .,:'", 0.35),
+    **dict.fromkeys("frt-()", 0.45),
+    **dict.fromkeys("mwMW%", 1.0),
+}
 
 Rectangle = tuple[float, float, float, float]  # x1, y1, x2, y2, y down
 
@@ -61,7 +67,7 @@ def place(
 
 def extent(text: str, size: float) -> tuple[float, float]:
     """Width and height of a name in a font of some size."""
-    return LETTER * size * len(text), LINE * size
+    return size * sum(_ADVANCE.get(letter, LETTER) for letter in text), LINE * size
 
 
 def _cornered(thing: Rectangle, width: float, height: float) -> Iterable[tuple[float, float]]:

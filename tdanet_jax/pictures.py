@@ -61,7 +61,7 @@ def _write(axes: Axes, text: str, x: float, y: float, points: float, weight: str
     # Letters are narrower than the room that was kept for them, so that bold ones fit as well.
     halo = [withStroke(linewidth=2, foreground="white")]
     style: dict[str, Any] = {"va": "top", "weight": weight, "path_effects": halo, "zorder": 9}
-    axes.text(x, y, text, fontsize=0.88 * points, **style)
+    axes.text(x, y, text, fontsize=0.92 * points, **style)
 
 
 def attention_episode(
@@ -124,7 +124,8 @@ def class_pairs(pairs: ClassPairs, unseen: Collection[str], title: str, path: Pa
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.set_facecolor("0.86")
-    axes.imshow(value, cmap=SHADES, vmin=0, vmax=1, aspect="auto")
+    if value.size:
+        axes.imshow(value, cmap=SHADES, vmin=0, vmax=1, aspect="auto")
     for g, c in zip(*np.nonzero(value >= 0.095), strict=True):
         color = "white" if value[g, c] > 0.85 else "black"
         text = f"{100 * value[g, c]:.0f}"
@@ -170,7 +171,7 @@ def trajectories(traces: Sequence[Trace], plan: FloorPlan, tables: SceneTables, 
         axes.set_axis_off()
     for axes, trace in zip(grid.flat, traces, strict=False):
         draw_plan(axes, plan, trace.target, 72 * scale)
-        _draw_way(axes, trace, plan, tables, 72 * scale)
+        draw_way(axes, trace, plan, tables, 72 * scale)
         axes.set_title(f"{trace.player}\n{trace.outcome}", fontsize=9.5)
     first = traces[0]
     figure.suptitle(f"{first.target} in {first.scene}", fontsize=12, y=0.995, va="top")
@@ -207,9 +208,10 @@ def draw_plan(axes: Axes, plan: FloorPlan, target: str, points_a_metre: float) -
         _write(axes, label.text, label.x, -label.y, size, weight)
 
 
-def _draw_way(
+def draw_way(
     axes: Axes, trace: Trace, plan: FloorPlan, tables: SceneTables, points_a_metre: float
 ) -> None:
+    """Path, start, some fields of view, numbers of steps, and a star or a cross at the end."""
     places = tables.position[trace.pose >> 4][:, [0, 2]]
     size = points_a_metre * labels.plan_font(plan)
     turns = (trace.pose >> 1 & 7) * 45
