@@ -56,17 +56,19 @@ def show(command: Command) -> None:
         command.choice,
         command.out or one_episode.folder_of(command.checkpoint) / "attention",
     )
-    rooms = one_episode.load_rooms(choice, [command.checkpoint])
-    player = one_episode.load_players([command.checkpoint], rooms, choice.policy)[0]
+    runs = [command.checkpoint]
+    rooms = one_episode.load_rooms(choice, runs)
     tables = rooms.tables
+    chosen = one_episode.choose(choice, runs, tables) if choice.given else None
+    player = one_episode.load_players(runs, rooms, choice.policy)[0]
     if not player.attends:
         fail(f"--checkpoint {command.checkpoint}: this model has no attention")
-    if choice.given:
-        trace = one_episode.play(choice, [command.checkpoint], [player], tables)[0]
-    else:
+    if chosen is None:
         played = play_lists(player, tables, choice.seed)
         write_pairs(player, tables, played, out)
         trace = example(player, tables, played)
+    else:
+        trace = one_episode.play(chosen, [player], tables, choice.seed)[0]
     out.mkdir(parents=True, exist_ok=True)
     picture = out / f"{trace.scene}-{trace.target}.png"
     with files.replacing(picture) as path:

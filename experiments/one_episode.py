@@ -12,6 +12,9 @@ from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from tdanet_jax.episodes import Episodes
     from tdanet_jax.scenes import SceneTables
     from tdanet_jax.scenes.dataset import Rooms
     from tdanet_jax.trace import Player, Trace
@@ -50,6 +53,8 @@ def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
     Args:
       required: whether choosing none is wrong, too.
     """
+    if not runs:
+        fail("give --checkpoint, the folder of a run")
     for run in runs:
         configs.load(folder_of(run) / CONFIG_FILE)
     if choice.episode is not None:
@@ -87,34 +92,41 @@ def load_players(runs: Sequence[Path], rooms: Rooms, policy: str) -> list[Player
     ]
 
 
-def play(
-    choice: Choice, runs: Sequence[Path], players: Sequence[Player], tables: SceneTables
-) -> list[Trace]:
-    """Each player's trace of the chosen episode; players[0] is the agent of runs[0]."""
-    from tdanet_jax import episode_lookup, trace
+Chosen = tuple["Episodes", "np.ndarray | None"]
+
+
+def choose(choice: Choice, runs: Sequence[Path], tables: SceneTables) -> Chosen:
+    """The episode that the flags mean, and the actions of runs[0] if it is a recorded one."""
+    from tdanet_jax import episode_lookup
 
     if choice.episode is not None:
-        recorded = episode_lookup.read_record(folder_of(runs[0]), choice.episode, tables)
-        again = trace.retrace(players[0], tables, recorded.episode, recorded.actions)
-        if again.success != recorded.success:
-            fail(f"--episode {choice.episode}: recorded on other scene tables")
-        others = players[1:]
-        return [again, *(trace.play(p, tables, recorded.episode, choice.seed) for p in others)]
+        return episode_lookup.read_record(folder_of(runs[0]), choice.episode, tables)
     assert choice.scene is not None
     assert choice.target is not None
     start = None if choice.start is None else episode_lookup.Start(*choice.start)
-    episode = episode_lookup.find(tables, choice.scene, choice.target, start, choice.seed)
-    return [trace.play(player, tables, episode, choice.seed) for player in players]
+    return episode_lookup.find(tables, choice.scene, choice.target, start, choice.seed), None
+
+
+def play(chosen: Chosen, players: Sequence[Player], tables: SceneTables, seed: int) -> list[Trace]:
+    """Each player's trace of the episode; players[0] is the agent of runs[0]."""
+    from tdanet_jax import trace
+
+    episode, actions = chosen
+    if actions is None:
+        return [trace.play(player, tables, episode, seed) for player in players]
+    recorded = trace.retrace(players[0], tables, episode, actions)
+    return [recorded, *(trace.play(player, tables, episode, seed) for player in players[1:])]
 
 
 def play_runs(choice: Choice, runs: Sequence[Path], rooms: Rooms, shortest: bool) -> list[Trace]:
-    """`play` for the agents of some runs; behind them the shortest path, if asked for."""
+    """The chosen episode, played by the agents of some runs and, if asked for, on the best way."""
     from tdanet_jax import trace
 
+    chosen = choose(choice, runs, rooms.tables)
     players = load_players(runs, rooms, choice.policy)
     if shortest:
         players.append(trace.Player("shortest path", players[0].task))
-    return play(choice, runs, players, rooms.tables)
+    return play(chosen, players, rooms.tables, choice.seed)
 
 
 def tell(traces: Sequence[Trace], out: Path) -> None:

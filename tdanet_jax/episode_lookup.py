@@ -34,7 +34,6 @@ class Recorded(NamedTuple):
 
     episode: Episodes
     actions: np.ndarray  # [T] int
-    success: bool
 
 
 def find(
@@ -125,4 +124,4 @@ def _parse(row: dict[str, Any], tables: SceneTables) -> Recorded:
         raise ValueError("recorded on other scene tables")
     if not len(actions):
         raise ValueError("no actions")
-    return Recorded(episode, actions, bool(row["success"]))
+    return Recorded(episode, actions)

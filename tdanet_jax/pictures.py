@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
@@ -31,6 +32,11 @@ MOST_SECTORS, MOST_NUMBERS = 6, 8
 DASHED = (0, (2.5, 1.3))
 REACH = 1.5  # metres, of the field of view that is drawn
 DPI = 110
+
+
+def formats() -> list[str]:
+    """Endings of the files that pictures can be written to."""
+    return sorted(FigureCanvasBase.get_supported_filetypes())
 
 
 def draw_view(axes: Axes, seen: View, attention: np.ndarray | None, target: str) -> None:

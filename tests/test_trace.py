@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import jax
 import numpy as np
@@ -141,10 +142,11 @@ def test_the_shortest_path_has_a_way_and_no_thoughts(some_rooms, player, chosen)
 
 def test_a_recorded_episode_is_shown_as_it_happened(some_rooms, player, opinionated_run):
     ways = set()
-    for i in range(8):
+    rows = [json.loads(row) for row in (opinionated_run / "episodes.jsonl").open()]
+    for i, row in enumerate(rows):
         record = episode_lookup.read_record(opinionated_run, i, some_rooms)
         seen = trace.retrace(player, some_rooms, record.episode, record.actions)
-        assert seen.success == record.success
+        assert seen.success == row["success"]
         np.testing.assert_array_equal(seen.actions, record.actions)
         ways.add(seen.outcome.split(",")[0])
     assert len(ways) > 1

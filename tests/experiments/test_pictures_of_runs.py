@@ -1,0 +1,143 @@
+"""The commands that show what an agent does: replay, trajectories, attention."""
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from experiments import attention, replay, trajectories
+from tdanet_jax import episodes
+from tdanet_jax.scenes import dataset
+from tdanet_jax.scenes.dataset import Rooms
+from tests import browser
+
+
+@pytest.fixture(scope="module")
+def rooms_file(some_rooms, tmp_path_factory):
+    """Eight rooms in a file, for `--data`."""
+    path = tmp_path_factory.mktemp("rooms") / "rooms.npz"
+    dataset.save(Rooms(some_rooms, None), path)
+    return str(path)
+
+
+@pytest.mark.parametrize("command", [replay, trajectories, attention])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "checkpoint"),
+        ("--checkpoint nowhere --episode 0", "nowhere/config.json: no such file"),
+        ("--checkpoint RUN --scene FloorPlan229", "give --scene and --target, or --episode"),
+        ("--checkpoint RUN --start 0 0 0", "give --scene and --target, or --episode"),
+        ("--checkpoint RUN --episode 0 --scene FloorPlan229", "--episode takes no --scene"),
+        ("--checkpoint RUN --episode 8", "no episode 8; there are 0 to 7"),
+        ("--checkpoint RUN --scene Attic --target Mug", "Attic: no such room; there are FloorPlan"),
+        ("--checkpoint RUN --scene FloorPlan229 --target Mug", "there: ArmChair, "),
+        (
+            "--checkpoint RUN --scene FloorPlan229 --target Painting --start 0 0 30",
+            "rotation 30: not a multiple of 45",
+        ),
+    ],
+)
+def test_wrong_arguments_give_one_line_and_write_nothing(
+    tmp_path, monkeypatch, capsys, rooms_file, opinionated_run, command, arguments, message
+):
+    monkeypatch.chdir(tmp_path)
+    words = [str(opinionated_run) if word == "RUN" else word for word in arguments.split()]
+    before = sorted(opinionated_run.rglob("*"))
+    with pytest.raises(SystemExit) as stop:
+        command.main([*words, "--data", rooms_file])
+    said = capsys.readouterr()
+    assert stop.value.code == 2
+    assert message in said.err
+    assert len(said.err.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+    assert sorted(opinionated_run.rglob("*")) == before
+
+
+def test_a_picture_of_an_unknown_kind_is_refused(tmp_path, capsys, rooms_file, opinionated_run):
+    out = tmp_path / "way.jpeg2"
+    with pytest.raises(SystemExit):
+        trajectories.main(
+            ["--checkpoint", str(opinionated_run), "--episode", "1", "--data", rooms_file,
+             "--out", str(out)]
+        )  # fmt: skip
+    assert "jpeg2" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ways_of_two_runs_and_the_shortest_are_drawn(tmp_path, capsys, rooms_file, opinionated_run):
+    run, out = str(opinionated_run), tmp_path / "new" / "way.svg"
+    trajectories.main(
+        ["--checkpoint", run, "--checkpoint", run, "--shortest", "--episode", "3",
+         "--data", rooms_file, "--out", str(out)]
+    )  # fmt: skip
+    record = json.loads((opinionated_run / "episodes.jsonl").read_text().splitlines()[3])
+    said = capsys.readouterr().out
+    assert f"{record['target']} in {record['scene']}" in said
+    how = "success" if record["success"] else "failure"
+    assert re.search(rf"{run}: {how}.*, {record['e']} action", said)
+    assert f"shortest path: success, {record['L']} action" in said
+    assert "<svg" in out.read_text()
+    assert [path.name for path in out.parent.iterdir()] == ["way.svg"]
+
+
+def test_attention_is_averaged_over_the_test_episodes_and_one_is_drawn(
+    tmp_path, monkeypatch, capsys, rooms_file, opinionated_run, some_rooms
+):
+    def few(tables, split, extras=None):
+        return {
+            "seen": episodes.draw(tables, split.eval_scenes, split.seen, 4, seed=0),
+            "unseen": episodes.draw(tables, split.eval_scenes, split.unseen, 4, seed=1),
+        }
+
+    monkeypatch.setattr(episodes, "load", few)
+    run, out = str(opinionated_run), tmp_path / "out"
+    attention.main(["--checkpoint", run, "--data", rooms_file, "--out", str(out)])
+    said = capsys.readouterr().out
+    assert "playing 32 test episodes" in said
+    names = {path.name for path in out.iterdir()}
+    assert len(names) == 4
+    assert {"class_pairs.csv", "class_pairs.md", "class_pairs.png"} < names
+    frames = int(re.search(r"([\d,]+) frames", said).group(1).replace(",", ""))
+    with (out / "class_pairs.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert frames > 32
+    assert {row["target"] for row in rows} <= set(some_rooms.targets)
+    assert max(int(row["frames"]) for row in rows) <= frames
+    shares = np.array([float(row["attention"]) for row in rows])
+    assert (shares >= 0).all()
+    assert (shares <= 1 + 1e-4).all()
+
+    attention.main(["--checkpoint", run, "--data", rooms_file, "--episode", "2", "--out", str(out)])
+    record = json.loads((opinionated_run / "episodes.jsonl").read_text().splitlines()[2])
+    assert (out / f"{record['scene']}-{record['target']}.png").stat().st_size > 10_000
+
+
+def test_the_page_of_a_real_room_as_a_user_asks_for_it(opinionated_run, tmp_path):
+    """Through the whole command, into a browser."""
+    out = tmp_path / "replay.html"
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.replay", "--checkpoint", str(opinionated_run),
+         "--scene", "FloorPlan228", "--target", "Laptop", "--policy", "greedy", "--out", str(out)],
+        capture_output=True, text=True, env=os.environ | {"PYTHONPATH": os.getcwd()},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "Laptop in FloorPlan228\n  my-run: " in done.stdout
+    assert out.stat().st_size < 1_000_000
+    html = out.read_text()
+    assert "http" not in html.replace("http://www.w3.org/2000/svg", "").replace("http-equiv", "")
+    with browser.launch() as chromium:
+        complaints = []
+        page = chromium.new_page()
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.goto(out.as_uri())
+        assert page.locator("h1").inner_text() == "Looking for Laptop in FloorPlan228 (living room)"
+        page.keyboard.press("End")
+        assert page.locator("#count").inner_text() == "end"
+        assert complaints == []
