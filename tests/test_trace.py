@@ -8,9 +8,12 @@ import json
 import jax
 import numpy as np
 import pytest
+from flax import linen as nn
 
-from tdanet_jax import env, episode_lookup, episodes, evaluation, trace
+from tdanet_jax import attention, env, episode_lookup, episodes, evaluation, replay, trace
 from tdanet_jax.env import TEST_STEP_LIMITS
+from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.reward import Parents
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.trace import Player
@@ -138,6 +141,36 @@ def test_the_shortest_path_has_a_way_and_no_thoughts(some_rooms, player, chosen)
         assert seen.probabilities is seen.value is seen.attention is seen.difference is None
     assert player.attends
     assert not best.attends
+
+
+class Blind(Encoder):
+    """Knows which target it is to find, and looks at nothing."""
+
+    def prepare(self, words):
+        return words
+
+    @nn.compact
+    def __call__(self, table, obs, action, keep=None):
+        return self.param("scale", nn.initializers.ones, ()) * table[obs.target]
+
+
+def test_a_network_without_attention_has_the_rest(some_rooms, player, chosen):
+    model = ActorCritic(Blind(), hidden=16)
+    weights = model.initialise(jax.random.key(0), player.task.words)
+    blind = dataclasses.replace(player, model=model, weights=weights)
+    assert not blind.attends
+    seen = trace.play(blind, some_rooms, one(chosen, 0))
+    assert seen.attention is seen.correspondence is seen.difference is None
+    np.testing.assert_allclose(seen.probabilities.sum(axis=1), 1, rtol=1e-5)
+    assert np.isfinite(seen.value).all()
+    page = replay.page([seen], some_rooms)
+    assert '"attends":false' in page
+    assert '"attention":' not in page
+    with pytest.raises(ValueError, match="no attention"):
+        attention.class_pairs(
+            model, weights, player.task.words, player.task.eval_params, seen.pose[:1],
+            chosen.target[:1], some_rooms.targets, some_rooms.classes,
+        )  # fmt: skip
 
 
 def test_a_recorded_episode_is_shown_as_it_happened(some_rooms, player, opinionated_run):
