@@ -132,7 +132,7 @@ class Trace:
 
 
 class View(NamedTuple):
-    """The n objects in view from a pose, in the tables' order."""
+    """The n detections from a pose, an object each, in the tables' order."""
 
     classes: tuple[str, ...]
     boxes: np.ndarray  # [n, 4] x1, y1, x2, y2 as shares of the image, y down
@@ -141,12 +141,18 @@ class View(NamedTuple):
 
 def view(tables: SceneTables, pose: int) -> View:
     """What is in view from a pose."""
-    rows = slice(tables.row_start[pose], tables.row_start[pose + 1])
+    rows = _detected(tables, pose)
     return View(
         classes=tuple(tables.classes[c] for c in tables.row_class[rows]),
         boxes=tables.row_box[rows] / (tables.image * tables.subpixel),
         within_reach=tables.row_visible[rows],
     )
+
+
+def _detected(tables: SceneTables, pose: int) -> np.ndarray:
+    """The tables' rows of a pose that are detections; what is visible without a box is none."""
+    rows = np.arange(tables.row_start[pose], tables.row_start[pose + 1])
+    return rows[tables.row_box[rows, 0] >= 0]
 
 
 def play(player: Player, tables: SceneTables, episode: Episodes, seed: int = 0) -> Trace:
@@ -230,7 +236,7 @@ def _think(player: Player, tables: SceneTables, trace: Trace, goal: int) -> Trac
 
 def _rows_of_objects(params: EnvParams, tables: SceneTables, pose: int) -> np.ndarray:
     """The observation's row of each of the n objects in view: [n] int."""
-    classes = tables.row_class[tables.row_start[pose] : tables.row_start[pose + 1]]
+    classes = tables.row_class[_detected(tables, pose)]
     if int(params.row_start[pose + 1] - params.row_start[pose]) == len(classes):
         return np.arange(len(classes))
     return np.unique(classes, return_inverse=True)[1]  # rows are one a class, in the same order

@@ -173,6 +173,16 @@ def test_a_network_without_attention_has_the_rest(some_rooms, player, chosen):
         )  # fmt: skip
 
 
+def test_what_has_no_box_is_not_in_view(some_rooms):
+    pose = int(np.diff(some_rooms.row_start).argmax())
+    boxes = some_rooms.row_box.copy()
+    boxes[some_rooms.row_start[pose] + 2] = -1
+    with_gap = dataclasses.replace(some_rooms, row_box=boxes)
+    whole, gap = trace.view(some_rooms, pose), trace.view(with_gap, pose)
+    assert gap.classes == whole.classes[:2] + whole.classes[3:]
+    np.testing.assert_array_equal(gap.boxes, np.delete(whole.boxes, 2, axis=0))
+
+
 def test_a_recorded_episode_is_shown_as_it_happened(some_rooms, player, opinionated_run):
     ways = set()
     rows = [json.loads(row) for row in (opinionated_run / "episodes.jsonl").open()]
