@@ -72,10 +72,13 @@ def extent(text: str, size: float) -> tuple[float, float]:
 
 def _cornered(thing: Rectangle, width: float, height: float) -> Iterable[tuple[float, float]]:
     x1, y1, x2, y2 = thing
+    above, below = (x1, y1 - height), (x1, y2)
+    if width > x2 - x1 and height > 0.5 * (y2 - y1):  # a name inside would hide the thing
+        yield from (above, below)
     yield x1, y1
-    yield x1, y1 - height
+    yield above
     yield x1, y2 - height
-    yield x1, y2
+    yield below
     yield x2 - width, y1
     yield x2 - width, y2 - height
     yield (x1 + x2 - width) / 2, (y1 + y2 - height) / 2

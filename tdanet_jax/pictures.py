@@ -129,7 +129,7 @@ def class_pairs(pairs: ClassPairs, unseen: Collection[str], title: str, path: Pa
     figure = Figure(figsize=(2.2 + 0.36 * len(order), 2.6 + 0.3 * len(kept)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    axes.set_facecolor("0.86")
+    axes.patch.set(facecolor="white", hatch="////", edgecolor="0.8", linewidth=0)
     if value.size:
         axes.imshow(value, cmap=SHADES, vmin=0, vmax=1, aspect="auto")
     for g, c in zip(*np.nonzero(value >= 0.095), strict=True):
@@ -150,7 +150,7 @@ def class_pairs(pairs: ClassPairs, unseen: Collection[str], title: str, path: Pa
     bar.set_label("mean attention, per cent")
     note = (
         "framed: the target, where in view; others: in frames without the target; "
-        f"grey: fewer than {MIN_FRAMES} frames"
+        f"hatched: fewer than {MIN_FRAMES} frames"
     )
     if unseen:
         note += "; * never a target in training"
