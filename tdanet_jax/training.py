@@ -6,7 +6,7 @@ import contextlib
 import json
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +120,7 @@ class Run:
             spent = max(spent, self.seconds / (60 * config.minutes))
         return spent
 
-    def chunks(self) -> Iterator[Row]:
+    def chunks(self, until: int | None = None) -> Iterator[Row]:
         """Trains to the end of the budget; yields one row of metrics per chunk.
 
         Of several processes, the lead alone writes files.
@@ -128,37 +128,74 @@ class Run:
         Compilation is not counted as training time. Stop iterating to stop training; `save` then
         keeps what is done.
 
+        Args:
+          until: stop at this many updates already.
+
         Raises:
           ValueError: too many updates were skipped; the state is saved first.
         """
-        journal = None
-        if devices.is_lead():
-            journal = Journal(self.folder / METRICS_FILE, int(self.state.updates))
-            history.drop_after(self.folder, int(self.state.updates))
+        journal = self._journal()
+        if self._over(until):
+            return
         chunk = self._compile()
-        while self.progress < 1.0:
-            before = self.progress
-            # The chunk is taken to go as those before it did: known from the state alone, so that
-            # a run that was stopped goes on with the same schedule.
-            chunks_done = int(self.state.updates) / self.config.chunk_updates
-            pace = before / chunks_done if chunks_done else 0.0
-            share = jnp.array([before, min(1.0, before + pace)], jnp.float32)
-            began = time.perf_counter()
-            self.state, metrics = chunk(self.state, share, self._words, self._params)
+        while not self._over(until):
+            before, shares, began = self.progress, self._shares(), time.perf_counter()
+            state, metrics = chunk(self.state, shares, self._words, self._params)
             metrics = jax.device_get(metrics)
             took = devices.from_lead(time.perf_counter() - began)
-            self.seconds += took
-            row = self._row(metrics, took)
-            if journal is not None:
-                journal.write(row)
-                self._keep_point(before)
-            yield row
-            if row["skipped"] >= self.config.max_skipped:
-                self.save()
-                raise ValueError(
-                    f"{self.folder}: {row['skipped']} updates skipped because the loss or gradient "
-                    "was not finite; the state is saved there"
-                )
+            yield self._record(state, metrics, before, took, journal)
+            self._check_finite()
+
+    def _over(self, until: int | None) -> bool:
+        stopped = until is not None and int(self.state.updates) >= until
+        return stopped or self.progress >= 1.0
+
+    def _journal(self) -> Journal | None:
+        """The journal, for the lead alone.
+
+        What was written behind the checkpoint is dropped: its updates will be done again.
+        """
+        if not devices.is_lead():
+            return None
+        history.drop_after(self.folder, int(self.state.updates))
+        return Journal(self.folder / METRICS_FILE, int(self.state.updates))
+
+    def _shares(self) -> jax.Array:
+        """Shares of the budget that are spent before and behind the next chunk.
+
+        The chunk is taken to go as those before it did: known from the state alone, so that a run
+        that was stopped goes on with the same schedule.
+        """
+        before = self.progress
+        chunks_done = int(self.state.updates) / self.config.chunk_updates
+        pace = before / chunks_done if chunks_done else 0.0
+        return jnp.array([before, min(1.0, before + pace)], jnp.float32)
+
+    def _record(
+        self,
+        state: TrainState,
+        metrics: dict[str, np.ndarray],
+        before: float,
+        took: float,
+        journal: Journal | None,
+    ) -> Row:
+        """Goes on to the state behind a chunk; writes its row and, if one is due, a point."""
+        self.state = state
+        self.seconds += took
+        row = self._row(metrics, took)
+        if journal is not None:
+            journal.write(row)
+            self._keep_point(before)
+        return row
+
+    def _check_finite(self) -> None:
+        skipped = int(self.state.skipped)
+        if skipped >= self.config.max_skipped:
+            self.save()
+            raise ValueError(
+                f"{self.folder}: {skipped} updates skipped because the loss or gradient "
+                "was not finite; the state is saved there"
+            )
 
     def _keep_point(self, before: float) -> None:
         """Adds to the history if the budget's share has passed a point since `before`.
@@ -209,6 +246,45 @@ class Run:
             "seconds": round(self.seconds, 3),
             "steps_per_second": round(steps / took, 1),
         }
+
+
+def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
+    """`Run.chunks` of several seeds of one configuration: their states stacked, one vmapped call.
+
+    A run that stands behind the others, after an interruption, first catches up on its own; then
+    the list holds its row alone.
+
+    Args:
+      runs: seeds of one configuration and task, with a budget in steps.
+
+    Raises:
+      ValueError: too many updates of a run were skipped; its state is saved first.
+    """
+    furthest = max(int(run.state.updates) for run in runs)
+    for run in runs:
+        for row in run.chunks(until=furthest):
+            yield [row]
+    if runs[0].progress >= 1.0:
+        return
+    config = runs[0].config
+    one = learner.make_train(config.learner, runs[0].model, config.chunk_updates)
+    several = jax.jit(jax.vmap(one, in_axes=(0, None, None, None)), donate_argnums=0)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(run.state for run in runs))
+    arguments = runs[0]._words, runs[0]._params
+    journals = [run._journal() for run in runs]
+    chunk = several.lower(stacked, runs[0]._shares(), *arguments).compile()
+    while runs[0].progress < 1.0:
+        before, shares, began = runs[0].progress, runs[0]._shares(), time.perf_counter()
+        stacked, metrics = chunk(stacked, shares, *arguments)
+        metrics = jax.device_get(metrics)
+        took = time.perf_counter() - began
+        rows = []
+        for i, (run, journal) in enumerate(zip(runs, journals, strict=True)):
+            state, own = (jax.tree.map(lambda x, i=i: x[i], tree) for tree in (stacked, metrics))
+            rows.append(run._record(state, own, before, took, journal))
+        yield rows
+        for run in runs:
+            run._check_finite()
 
 
 _UPDATE_MEANS = ("policy_loss", "value_loss", "entropy", "grad_norm")
