@@ -12,7 +12,7 @@ from tdanet_jax import history, words
 from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.task import make_model, make_task
-from tdanet_jax.training import Run, read_metrics
+from tdanet_jax.training import Run, chunks_together, read_metrics
 
 #: Eight chunks of two updates of 8 x 5 steps.
 TINY = TrainConfig(
@@ -91,6 +91,28 @@ def test_the_history_holds_the_parameters_at_each_point(whole):
     assert [point.episodes for point in kept] == [row["episodes"] for row in rows]
     chex.assert_trees_all_equal(kept[-1].weights, jax.device_get(run.state.params))
     assert not np.array_equal(*(point.weights["actor"]["kernel"] for point in kept[-2:]))
+
+
+def test_seeds_trained_together_go_the_way_of_each_alone(whole, task, tmp_path):
+    """One seed stands two chunks ahead, as after an interruption; the other catches up alone."""
+    configs = [dataclasses.replace(TINY, seed=seed) for seed in (0, 1)]
+    ahead, behind = (Run(tmp_path / f"seed{c.seed}", c, task) for c in configs)
+    ahead.folder.mkdir(exist_ok=True)
+    behind.folder.mkdir(exist_ok=True)
+    list(ahead.chunks(until=4))
+    assert int(ahead.state.updates) == 4
+    widths = [len(rows) for rows in chunks_together([ahead, behind])]
+    assert widths == [1, 1] + [2] * 6
+    for run in (ahead, behind):
+        run.save()
+        assert [row["steps"] for row in read_metrics(run.folder)] == list(range(80, 641, 80))
+        assert [history.read(p).point for p in history.points(run.folder)] == list(range(1, 9))
+        assert int(Run(run.folder, run.config, task).state.updates) == 16
+    # The first chunk in common: equal but for the rounding of batched products.
+    alone, together = whole[2][2], read_metrics(ahead.folder)[2]
+    for name in ("episodes", "success", "length", "policy_loss", "value_loss", "entropy"):
+        assert together[name] == pytest.approx(alone[name], rel=0.02, abs=0.002), name
+    assert without_times(read_metrics(behind.folder)) != without_times(read_metrics(ahead.folder))
 
 
 def test_the_weights_of_a_run_are_read_alone(whole):

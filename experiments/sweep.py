@@ -1,0 +1,256 @@
+"""Trains several splits, models and seeds, and reports them in the form of the paper's tables.
+
+    python -m experiments.sweep --splits 18/4 14/8 --seeds 0 1 2 --minutes 10 --out runs/sweep
+
+Every further flag is one of the training command and holds for all runs. After an interruption run
+the same command again: finished runs are skipped, the one that was begun goes on. Writes a folder
+for each run, report.md, report.json and the learning curves into --out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from experiments import train_zero_shot
+from experiments.benchmark import decision_row, processor
+from experiments.console import (
+    StopRequest,
+    check_positive,
+    console,
+    fail,
+    one_line_errors,
+    one_line_usage,
+    reporter,
+    stoppable,
+)
+from experiments.train_zero_shot import figures_of, parse_command, prepare, report_on, title, train
+from tdanet_jax import sweep
+from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.sweep import Cost, Finished
+
+if TYPE_CHECKING:
+    from tdanet_jax.training import Run
+
+#: Batches whose inference time is reported.
+BATCHES = (1, 1024)
+#: Seed of the sampled actions with which histories are evaluated.
+EVALUATION_SEED = 0
+#: Exit statuses above this one mean that a signal stopped the program.
+SIGNALLED = 128
+#: Flags of the training command that a sweep sets itself.
+OWN = {
+    "--split": "--splits",
+    "--model": "--models",
+    "--seed": "--seeds",
+    "--resume": "the same command again in its place",
+    "--tensorboard": "none",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Trains several splits, models and seeds; every further flag is one of train_zero_shot."""
+
+    out: Path
+    """Folder of the sweep: a folder for each run, and the report."""
+    splits: tuple[str, ...] = ("18/4",)
+    """Splits to train on."""
+    models: tuple[str, ...] = ("tdanet",)
+    """Models to train, ablations included; see --model of train_zero_shot."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of each."""
+    vmap_seeds: bool = False
+    """Train the seeds of a split and model in one vmapped call; needs a budget in steps. Made for
+    accelerators: on two cores it is slower than one after the other, unless networks are small."""
+    report_only: bool = False
+    """Train nothing; report on the runs in --out that are finished, and on --include."""
+    include: tuple[Path, ...] = ()
+    """Finished runs elsewhere that the report takes in."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command."""
+    words = sys.argv[1:] if arguments is None else arguments
+    with one_line_errors():
+        with one_line_usage():
+            command, rest = tyro.cli(
+                Command, args=words, return_unknown_args=True, prog="sweep", description=__doc__
+            )
+        if command.report_only and rest:
+            fail(f"--report-only trains nothing and takes no {rest[0]}")
+        for word in rest:
+            if word.partition("=")[0] in OWN:
+                fail(f"{word}: a sweep takes {OWN[word.partition('=')[0]]}")
+        training = parse_command(rest)
+        base = training.run.with_absolute_paths()
+        configs = sweep.plan(base, command.splits, command.models, command.seeds)
+        if command.vmap_seeds and (base.episodes is not None or base.minutes is not None):
+            fail("--vmap-seeds needs a budget in --steps: seeds that end apart cannot share a call")
+        if command.vmap_seeds and training.devices > 1:
+            fail("--vmap-seeds and --devices: choose one")
+        if os.environ.get("JAX_COORDINATOR_ADDRESS"):
+            fail("a sweep is one process; JAX_COORDINATOR_ADDRESS is set")
+        check_positive(devices=training.devices)
+        included = [sweep.finished(folder) for folder in command.include]
+        try:
+            if not command.report_only:
+                train_all(command, training, configs)
+            with stoppable(lambda: "what is evaluated is kept"):
+                write_report(command.out, [*sweep.find(command.out), *included])
+        except SystemExit as stop:
+            if isinstance(stop.code, int) and stop.code > SIGNALLED:
+                console.print("the sweep goes on with the same command")
+            raise
+
+
+def train_all(
+    command: Command, training: train_zero_shot.Command, configs: Sequence[TrainConfig]
+) -> None:
+    """Trains what is not finished.
+
+    Args:
+      training: the flags of the training command.
+      configs: what to train.
+    """
+    from tdanet_jax import devices
+    from tdanet_jax.task import resolve_precision
+
+    devices.connect(training.devices)
+    devices.keep_compiled()
+    configs = [
+        dataclasses.replace(config, network=resolve_precision(config.network)) for config in configs
+    ]
+    folders = [command.out / sweep.run_name(config) for config in configs]
+    # All are looked at before the first trains: a clash shows at once, not after hours.
+    states = [sweep.progress(*pair) for pair in zip(folders, configs, strict=True)]
+    todo = [
+        (config, folder)
+        for config, folder, state in zip(configs, folders, states, strict=True)
+        if state != "finished"
+    ]
+    console.print(f"{len(configs)} runs, {len(configs) - len(todo)} finished, {len(todo)} to train")
+    if command.vmap_seeds:
+        together: dict[tuple[str, str], list[tuple[TrainConfig, Path]]] = {}
+        for config, folder in todo:
+            together.setdefault((config.split, config.model), []).append((config, folder))
+        for members in together.values():
+            train_together(members)
+    else:
+        for config, folder in todo:
+            begun = folder if (folder / CONFIG_FILE).exists() else None
+            train(config, folder, dataclasses.replace(training, resume=begun))
+
+
+def train_together(members: Sequence[tuple[TrainConfig, Path]]) -> None:
+    """Trains seeds of one split and model in one vmapped call, then reports on each."""
+    from tdanet_jax import episodes, files
+    from tdanet_jax.task import load_task
+    from tdanet_jax.training import Run
+
+    with stoppable(lambda: "every seed is saved") as stop, contextlib.ExitStack() as locks:
+        with reporter("rooms", every=30, transient=True) as show:
+            task = load_task(members[0][0], lambda done, total: show(done / total, "rebuilt"))
+        lists = episodes.load(task.tables, task.split, task.extras)
+        runs = []
+        for config, folder in members:
+            locks.enter_context(files.locked(folder))
+            prepare(folder, config, task, resume=(folder / CONFIG_FILE).exists())
+            runs.append(Run(folder, config, task))
+            console.print(f"{title(runs[-1])} -> {folder}")
+        learn_together(runs, stop)
+        for run in runs:
+            report_on(run, lists)
+
+
+def learn_together(runs: Sequence[Run], stop: StopRequest) -> None:
+    """Trains all to the end of the budget or to a signal, and saves."""
+    from tdanet_jax.training import chunks_together
+
+    def save() -> float:
+        for run in runs:
+            run.save()
+        return runs[0].seconds
+
+    saved = save()  # who cannot save learns it before training, not after
+    console.print("compiling ...")
+    with stop.deferred(), reporter("training", every=10) as show:
+        for rows in chunks_together(runs):
+            show(runs[0].progress, f"{len(rows)} seeds, each: {figures_of(rows[0])}")
+            if stop.signal is not None:
+                break
+            if runs[0].seconds - saved > 60 * runs[0].config.checkpoint_minutes:
+                saved = save()
+        save()
+
+
+def write_report(out: Path, runs: Sequence[Finished]) -> None:
+    """Evaluates what is missing, and writes the report."""
+    from tdanet_jax import figures, files, report
+
+    if not runs:
+        fail(f"{out}: no finished run")
+    check_alike(runs)
+    out.mkdir(parents=True, exist_ok=True)
+    with files.locked(out):
+        with reporter("histories", every=20) as show:
+            for run, points in sweep.histories(runs, out, EVALUATION_SEED):
+                show(points / max(run.config.history, points), run.folder.name)
+        curves = sweep.make_curves(runs, out)
+        console.print("measuring inference ...")
+        found = sweep.Report(
+            runs=runs,
+            untrained=sweep.untrained(runs, EVALUATION_SEED),
+            costs=costs(runs),
+            curves=curves,
+            machine=processor(),
+            code=report.code_version(),
+        )
+        names = {split: f"learning_curve-{split.replace('/', '-')}.png" for split in curves}
+        for split, name in names.items():
+            figures.evaluated_curves(curves[split], f"Split {split}, test rooms", out / name)
+        files.write_text(out / "report.json", json.dumps(sweep.to_json(found), indent=2) + "\n")
+        files.write_text(out / "report.md", sweep.markdown(found, names))
+    console.print(f"wrote {out / 'report.md'}")
+
+
+def check_alike(runs: Sequence[Finished]) -> None:
+    """Fails if the runs cannot stand in one table."""
+    names = [run.folder.name for run in runs]
+    for name in names:
+        if names.count(name) > 1:
+            fail(f"two runs are called {name}: rename one of the folders")
+    for run in runs:
+        if run.results["data_version"] != runs[0].results["data_version"]:
+            fail(f"{run.folder}: was evaluated on other scene tables than {runs[0].folder}")
+
+
+def costs(runs: Sequence[Finished]) -> dict[str, Cost]:
+    """Parameters and inference time of every model among the runs, on this machine."""
+    import jax
+
+    from tdanet_jax.task import load_task
+
+    out: dict[str, Cost] = {}
+    for run in runs:
+        if run.config.model not in out:
+            task = load_task(run.config)
+            shapes = jax.eval_shape(task.model.initialise, jax.random.key(0), task.words)
+            rows = {batch: decision_row(task, batch, repeats=5) for batch in BATCHES}
+            out[run.config.model] = Cost(
+                parameters=sum(leaf.size for leaf in jax.tree.leaves(shapes)),
+                milliseconds={batch: row["milliseconds"] for batch, row in rows.items()},
+            )
+    return out
+
+
+if __name__ == "__main__":
+    main()
