@@ -61,6 +61,10 @@ class Command:
     """Numbers of environments in the `rollout` and `update` parts."""
     precisions: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
     """Operands of the products in the `rollout` and `update` parts."""
+    networks: tuple[int, ...] = (1,)
+    """Numbers of networks that are evaluated in one call; 20 is a run's history."""
+    checkpoint: Path | None = None
+    """Run whose trained network the `evaluation` part plays; by default an untrained one."""
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
     devices: int = 1
@@ -83,6 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
             devices=command.devices,
             environments=command.environments,
             batches=command.batches,
+            networks=command.networks,
         )
         rows = []
         for row in measure(command):
@@ -128,7 +133,8 @@ def measure(command: Command) -> Iterator[Row]:
             if "update" in command.parts:
                 yield update_row(task, precision, count, peak, command.repeats)
     if "evaluation" in command.parts:
-        yield evaluation_row(task, command.repeats)
+        for networks in command.networks:
+            yield evaluation_row(command.checkpoint, task, networks, command.repeats)
     if "decision" in command.parts:
         for count in (1, 1024):
             yield decision_row(task, count, command.repeats)
@@ -391,25 +397,38 @@ def update_cost(
     }
 
 
-def evaluation_row(task: Task, repeats: int) -> Row:
-    """All episodes of a split, sampled actions of an untrained network (the longest case)."""
+def evaluation_row(run: Path | None, task: Task, networks: int, repeats: int) -> Row:
+    """All episodes of a split with sampled actions, for several networks in one call.
+
+    Args:
+      run: folder of a trained run, whose network plays; None takes an untrained one, which says
+        Done early and is done sooner.
+    """
     import jax
+    import jax.numpy as jnp
 
-    from tdanet_jax import episodes, evaluation, policies
+    from tdanet_jax import episodes, evaluation, policies, saved
+    from tdanet_jax.task import load_task
 
-    model = task.model
-    weights = model.initialise(jax.random.key(0), task.words)
-    policy = policies.network(model, task.words)
+    if run is None:
+        weights = task.model.initialise(jax.random.key(0), task.words)
+    else:
+        network = saved.find(run)[0]
+        task, weights = load_task(network.config), network.load().weights
+    stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * networks), weights)
+    policy = policies.network(task.model, task.words)
     lists = episodes.load(task.tables, task.split, task.extras)
 
     def call() -> Any:
-        played = evaluation.evaluate_lists(policy, weights, task.eval_params, lists, 0)
-        return [records.length for _, records in played.values()]
+        played = evaluation.evaluate_stacked(policy, stacked, task.eval_params, lists, 0)
+        return [records.length for one in played for _, records in one.values()]
 
     first, seconds = timed(call, repeats)
     return {
         "part": "evaluation",
-        "episodes": sum(len(chosen) for chosen in lists.values()),
+        "networks": networks,
+        "trained": run is not None,
+        "episodes": networks * sum(len(chosen) for chosen in lists.values()),
         "compile_seconds": round(first - seconds, 2),
         "seconds": round(seconds, 2),
     }
@@ -457,7 +476,9 @@ def processor() -> str:
 def as_table(rows: list[Row]) -> Table:
     """All rows as one table: the part, its setting, and its figures."""
     table = Table("part", "setting", "figures")
-    settings = ("environments", "devices", "observations", "precision", "batch", "episodes")
+    settings = (
+        "environments", "devices", "observations", "precision", "batch", "networks", "episodes",
+    )  # fmt: skip
     for row in rows:
         setting = ", ".join(f"{k} {row[k]}" for k in settings if k in row)
         figures = ", ".join(f"{k} {v}" for k, v in row.items() if k not in (*settings, "part"))

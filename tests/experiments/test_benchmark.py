@@ -9,6 +9,7 @@ from experiments import benchmark
 from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.task import make_model
+from tests.test_agent import OLD_RUN
 
 
 def test_it_writes_one_json_object_per_figure(ithor, tmp_path):
@@ -30,3 +31,11 @@ def test_the_hand_formula_counts_the_kernels_that_a_step_uses():
     del weights["encoder"]["attention"]
     kernels = sum(leaf.size for leaf in jax.tree.leaves(weights) if leaf.ndim == 2)
     assert benchmark.forward_macs(model, 50) == kernels
+
+
+def test_an_evaluation_plays_the_networks_of_a_run_in_one_call(ithor, tmp_path):
+    out = tmp_path / "figures.jsonl"
+    flags = ["--networks", "2", "--checkpoint", str(OLD_RUN), "--repeats", "1", "--out", str(out)]
+    benchmark.main(["--parts", "evaluation", *flags])
+    row = json.loads(out.read_text().splitlines()[-1])
+    assert (row["networks"], row["trained"], row["episodes"]) == (2, True, 4000)

@@ -1,0 +1,110 @@
+"""The sweep command, as a user types it."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from experiments import sweep
+
+COMMAND = [sys.executable, "-m", "experiments.sweep"]
+TINY = [
+    "--steps", "800", "--num-envs", "8", "--rollout-steps", "5", "--width", "16", "--hidden", "16",
+    "--history", "2", "--precision", "float32",
+]  # fmt: skip
+RUN_FILES = {
+    "config.json", "classes.json", "metrics.jsonl", "checkpoints", "history", "results.json",
+    "results.md", "episodes.jsonl", "learning_curve.png", ".lock",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "Missing from sweep: --out"),
+        (["--out=x", "--split", "14/8"], "--split: a sweep takes --splits"),
+        (["--out=x", "--splits", "17/5"], "--split 17/5: choose one of"),
+        (["--out=x", "--models", "cnn"], "--model cnn: choose one of"),
+        (["--out=x", "--seeds", "1", "1"], "--seeds: a value is given twice"),
+        (["--out=x", "--stepz", "5"], "Unrecognized options: --stepz"),
+        (["--out=x", "--vmap-seeds", "--minutes", "1"], "--vmap-seeds needs a budget in --steps"),
+        (["--out=x", "--report-only", "--steps", "5"], "--report-only trains nothing"),
+        (["--out=x", "--report-only"], "x: no finished run"),
+        (["--out=x", "--report-only", "--include", "y"], "y/config.json: no such file"),
+    ],
+)
+def test_wrong_arguments_give_one_line_and_write_nothing(
+    tmp_path, monkeypatch, capsys, arguments, message
+):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        sweep.main(arguments)
+    assert stop.value.code == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert len(said.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_sweep_trains_evaluates_the_history_and_reports(ithor, tmp_path, capsys):
+    out = tmp_path / "sweep"
+    arguments = ["--seeds", "0", *TINY, "--out", str(out)]
+    sweep.main(arguments)
+    run = out / "18-4-tdanet-seed0"
+    assert {path.name for path in run.iterdir()} == RUN_FILES
+    written = {"report.md", "report.json", "learning_curve-18-4.png", "histories", run.name}
+    assert {path.name for path in out.iterdir()} == written | {".lock"}
+    report = json.loads((out / "report.json").read_text())
+    models = report["comparison"]["18/4"]
+    assert models["shortest_path"]["unseen"]["L>=1"]["SPL"] == {"mean": 100.0, "sd": None}
+    assert 8 < models["random"]["seen"]["L>=1"]["SR"]["mean"] < 15
+    assert len(report["learning_curves"]["18/4"]["tdanet"]["episodes"]) == 2
+    assert set(report["costs"]["tdanet"]["milliseconds"]) == {"1", "1024"}
+    assert "Split 14/8: nothing was trained." in (out / "report.md").read_text()
+
+    with pytest.raises(SystemExit):
+        sweep.main([*arguments, "--step-limit", "7"])
+    assert "trained with other values of --step-limit" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_sweep_skips_what_is_finished_and_reports_on_runs_elsewhere(ithor, tmp_path, capsys):
+    out = tmp_path / "sweep"
+    arguments = ["--seeds", "0", *TINY, "--out", str(out)]
+    sweep.main(arguments)
+    run = out / "18-4-tdanet-seed0"
+    results = (run / "results.json").read_text()
+    (run / "results.json").unlink()  # as if it had been killed in its evaluation
+    sweep.main(arguments)
+    assert "1 runs, 0 finished, 1 to train" in capsys.readouterr().out
+    assert json.loads((run / "results.json").read_text()) == json.loads(results)
+    (run / "checkpoints").rename(tmp_path / "gone")  # a finished run needs none
+    sweep.main([*arguments[:1], "0", "1", *arguments[2:], "--vmap-seeds"])
+    assert "2 runs, 1 finished, 1 to train" in capsys.readouterr().out
+    assert len(json.loads((out / "report.json").read_text())["runs"]) == 2
+    sweep.main(["--report-only", "--out", str(tmp_path / "other"), "--include", str(run)])
+    assert f"| {run.name} | 0 |" in (tmp_path / "other" / "report.md").read_text()
+
+
+@pytest.mark.slow
+def test_a_sweep_that_is_killed_again_and_again_ends_as_one_that_was_not(ithor, tmp_path):
+    """SIGKILL at random moments; then the runs and the report are those of a sweep in peace."""
+    arguments = ["--seeds", "0", "1", "--models", "tdanet", "tdanet-no-ta", *TINY]
+    environment = os.environ | {"PYTHONPATH": os.getcwd()}
+    peaceful, killed = tmp_path / "peaceful", tmp_path / "killed"
+    subprocess.run([*COMMAND, *arguments, "--out", str(peaceful)], check=True, env=environment)
+    draw = random.Random(0)
+    for _ in range(12):
+        process = subprocess.Popen([*COMMAND, *arguments, "--out", str(killed)], env=environment)
+        time.sleep(draw.uniform(4, 40))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    subprocess.run([*COMMAND, *arguments, "--out", str(killed)], check=True, env=environment)
+    ours, theirs = (json.loads((out / "report.json").read_text()) for out in (killed, peaceful))
+    for part in ("comparison", "learning_curves", "left_out"):
+        assert ours[part] == theirs[part]
