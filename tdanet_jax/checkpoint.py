@@ -149,30 +149,45 @@ class Checkpoints:
             meta = self._orbax.restore(path, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
             written = meta["meta"]["format"]
             if written <= FORMAT:
-                state = self._orbax.restore(
-                    path, args=ocp.args.Composite(state=ocp.args.StandardRestore(blank))
+                read = self._orbax.restore(
+                    path, args=ocp.args.Composite(state=ocp.args.StandardRestore())
                 )
+                state = read["state"] if blank is None else _fitted(read["state"], blank)
         except Exception as error:  # Orbax raises many kinds for a damaged folder
             raise ValueError(f"{path}: unreadable checkpoint ({_reason(error)})") from error
-        if written <= FORMAT and blank is not None:
-            _check_shapes(path, state["state"], blank)
         if written > FORMAT:
             raise NewerFormat(
                 f"{path}: checkpoint of format {written}, this version reads up to {FORMAT}: "
                 "a newer tdanet_jax wrote it"
             )
-        return state["state"], dict(meta["meta"])
+        return state, dict(meta["meta"])
 
 
-def _check_shapes(path: Path, found: Any, blank: Any) -> None:
-    """Raises ValueError if an array is not of the size that the configuration asks for."""
-    for (where, value), expected in zip(
-        jax.tree_util.tree_leaves_with_path(found), jax.tree.leaves(blank), strict=True
-    ):
-        if value.shape != expected.shape or value.dtype != expected.dtype:
-            name = jax.tree_util.keystr(where)
-            reason = f"{name} is {value.dtype}{value.shape}, not {expected.dtype}{expected.shape}"
-            raise ValueError(f"{path}: unreadable checkpoint ({reason})")
+def _fitted(values: Any, blank: Any) -> Any:
+    """The tree of `blank` with the values that have the same names in another tree.
+
+    By name, because a later version of the state may have further parts that are None here, which
+    the files of an earlier one do not mention.
+
+    Raises:
+      ValueError: names, shapes or types differ.
+    """
+    found = {_name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(values)}
+    wanted = {_name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(blank)}
+    for name in sorted(found.keys() ^ wanted.keys()):
+        raise ValueError(f"{name} is {'missing' if name in wanted else 'of no use here'}")
+    for name, leaf in wanted.items():
+        one, other = (f"{x.dtype}{x.shape}" for x in (found[name], leaf))
+        if one != other:
+            raise ValueError(f"{name} is {one}, not {other}")
+    return jax.tree.unflatten(
+        jax.tree.structure(blank), [np.asarray(found[name]) for name in wanted]
+    )
+
+
+def _name(path: tuple[Any, ...]) -> str:
+    """params/actor/kernel, whether the parts are fields, keys or places."""
+    return jax.tree_util.keystr(path, simple=True, separator="/")
 
 
 def _plain(state: TrainState) -> TrainState:

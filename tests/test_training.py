@@ -2,17 +2,20 @@
 
 import dataclasses
 import json
+import shutil
 
 import chex
 import jax
 import numpy as np
 import pytest
 
+from tdanet_jax import config as configs
 from tdanet_jax import history, words
 from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.task import make_model, make_task
 from tdanet_jax.training import Run, chunks_together, read_metrics
+from tests.test_agent import OLD_RUN
 
 #: Eight chunks of two updates of 8 x 5 steps.
 TINY = TrainConfig(
@@ -93,6 +96,7 @@ def test_the_history_holds_the_parameters_at_each_point(whole):
     assert not np.array_equal(*(point.weights["actor"]["kernel"] for point in kept[-2:]))
 
 
+@pytest.mark.slow
 def test_seeds_trained_together_go_the_way_of_each_alone(whole, task, tmp_path):
     """One seed stands two chunks ahead, as after an interruption; the other catches up alone."""
     configs = [dataclasses.replace(TINY, seed=seed) for seed in (0, 1)]
@@ -176,6 +180,18 @@ def test_a_checkpoint_of_another_network_is_refused(whole, task):
     other = dataclasses.replace(task, model=make_model(wider, task.classes))
     with pytest.raises(ValueError, match="unreadable checkpoint"):
         Run(whole[0], wider, other)
+
+
+def test_a_run_of_the_first_version_goes_on(ithor, tmp_path):
+    """Its state lacks what was added since; all that was in it is still there."""
+    folder = shutil.copytree(OLD_RUN, tmp_path / "run")
+    config = configs.load(folder / "config.json")
+    run = Run(folder, config, make_task(config, ithor, words.load_bundled()))
+    assert (int(run.state.updates), int(run.state.episodes), run.steps) == (2, 1, 16)
+    read = Checkpoints(folder).snapshot()
+    chex.assert_trees_all_equal(run.state.params, read.weights)
+    moments = jax.tree.leaves(run.state.opt_state)
+    assert any(np.asarray(leaf).any() for leaf in moments)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
