@@ -110,7 +110,12 @@ class Stopped(KeyboardInterrupt):
 
 
 class StopRequest:
-    """Turns SIGTERM and Ctrl-C into `Stopped`, at once or, inside `deferred`, at its end."""
+    """Turns SIGTERM and Ctrl-C into `Stopped`, at once or, inside `deferred`, at its end.
+
+    Attributes:
+      signal: the first one's number. Python drops what is raised while it collects garbage: such a
+        stop happens at the next `deferred`.
+    """
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -119,19 +124,23 @@ class StopRequest:
     @contextlib.contextmanager
     def deferred(self) -> Iterator[None]:
         """Inside, the first signal is remembered in `signal`; a second one does not wait."""
+        self._check()
         self._deferring = True
         try:
             yield
         finally:
             self._deferring = False
+        self._check()
+
+    def _check(self) -> None:
         if self.signal is not None:
             raise Stopped(self.signal)
 
     def receive(self, number: int, frame: Any) -> None:
         """The signals' handler."""
-        if self._deferring and self.signal is None:
-            self.signal = number
-        else:
+        first = self.signal is None
+        self.signal = number
+        if not (first and self._deferring):
             raise Stopped(number)
 
 

@@ -118,11 +118,11 @@ def default_folder(config: TrainConfig) -> Path:
 
 def train(config: TrainConfig, folder: Path, command: Command) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
-    from tdanet_jax import devices, episodes, files
-    from tdanet_jax.task import load_task, resolve
-    from tdanet_jax.training import Run
-
     with stoppable(lambda: how_to_go_on(folder)) as stop:
+        from tdanet_jax import devices, episodes, files
+        from tdanet_jax.task import load_task, resolve
+        from tdanet_jax.training import Run
+
         mesh = devices.connect(command.devices)
         devices.keep_compiled()
         console.quiet = not devices.is_lead()
@@ -230,7 +230,7 @@ def metrics_sink(folder: Path, tensorboard: bool) -> Iterator[Callable[[Row], No
             if writer is None:
                 (folder / "tensorboard").mkdir(exist_ok=True)
                 writer = EventsWriter(str(folder / "tensorboard" / "events"))
-            for name in row:
+            for name in (name for name in row if name != "steps"):
                 summary = scalar(f"train/{name}", row[name])
                 writer.write_event(Event(wall_time=time.time(), step=row["steps"], summary=summary))
             writer.flush()

@@ -8,10 +8,13 @@ version, training time, data version) and `SHA256SUMS`, the checksums of all its
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import shutil
+import sys
+import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +31,8 @@ FOLDER = "checkpoints"
 CHECKSUMS = "SHA256SUMS"
 KEPT = 2
 
-logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax narrates every file it touches
+# Orbax narrates every file it touches, and every error that it raises besides.
+logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 class NewerFormat(ValueError):
@@ -64,19 +68,23 @@ class Checkpoints:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             shutil.rmtree(fresh, ignore_errors=True)
-            self._orbax.save(
-                fresh,
-                args=ocp.args.Composite(
-                    state=ocp.args.StandardSave(jax.device_get(_plain(state))),
-                    meta=ocp.args.JsonSave({**meta, "format": FORMAT}),
-                ),
-            )
+            content = jax.device_get(_plain(state))
+            _check_space(self.folder, content)
+            with _quiet_threads():
+                self._orbax.save(
+                    fresh,
+                    args=ocp.args.Composite(
+                        state=ocp.args.StandardSave(content),
+                        meta=ocp.args.JsonSave({**meta, "format": FORMAT}),
+                    ),
+                )
             sums = "".join(f"{sha}  {name}\n" for name, sha in _checksums(fresh).items())
             (fresh / CHECKSUMS).write_text(sums)
             shutil.rmtree(path, ignore_errors=True)  # only a damaged one can be there
             fresh.rename(path)
         except Exception as error:  # Orbax and TensorStore raise many kinds, for a full disk too
-            files.remove_partial(self.folder)
+            with contextlib.suppress(OSError):  # its threads may still write into it
+                files.remove_partial(self.folder)
             kept = f"the one before it is {self.latest()}" if self._steps() else "there is no other"
             reason = f"checkpoint not written ({_reason(error)}); {kept}"
             raise ValueError(f"{path}: {reason}") from error
@@ -188,6 +196,26 @@ def _fitted(values: Any, blank: Any) -> Any:
 def _name(path: tuple[Any, ...]) -> str:
     """params/actor/kernel, whether the parts are fields, keys or places."""
     return jax.tree_util.keystr(path, simple=True, separator="/")
+
+
+@contextlib.contextmanager
+def _quiet_threads() -> Iterator[None]:
+    """Orbax's threads hand their errors to the caller; inside, they do not print them besides."""
+    before = threading.excepthook, sys.unraisablehook
+    threading.excepthook, sys.unraisablehook = lambda error: None, lambda error: None
+    try:
+        yield
+    finally:
+        threading.excepthook, sys.unraisablehook = before
+
+
+def _check_space(folder: Path, content: Any) -> None:
+    """Raises OSError if the disk cannot hold a state. Orbax finds out, too, but half-way."""
+    needed = sum(array.nbytes for array in jax.tree.leaves(content))
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        megabytes = f"{needed / 1e6:.1f} MB needed, {free / 1e6:.1f} MB free"
+        raise OSError(f"No space left on device: {megabytes}")
 
 
 def _plain(state: TrainState) -> TrainState:

@@ -194,7 +194,7 @@ class Run:
             self.save()
             raise ValueError(
                 f"{self.folder}: {skipped} updates skipped because the loss or gradient "
-                "was not finite; the state is saved there"
+                f"was not finite; the state is saved as checkpoint {int(self.state.updates)}"
             )
 
     def _keep_point(self, before: float) -> None:

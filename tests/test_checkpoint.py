@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 import subprocess
 import warnings
 from collections.abc import Callable
@@ -133,6 +134,26 @@ def test_a_damaged_checkpoint_does_not_outlive_the_next(saved: Checkpoints) -> N
     saved.save(after(3), {"seconds": 1.5})
     assert sorted(path.name for path in saved.folder.iterdir()) == ["2", "3"]
     assert restored(saved) == 3
+
+
+def test_a_checkpoint_of_a_newer_version_is_not_passed_over(
+    saved: Checkpoints, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "FORMAT", checkpoint.FORMAT + 1)
+        saved.save(after(3), {})
+    with pytest.raises(ValueError, match="a newer tdanet_jax wrote it"):
+        saved.restore(make_state)
+
+
+def test_a_disk_without_room_is_known_before_anything_is_written(
+    saved: Checkpoints, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nearly_full = shutil._ntuple_diskusage(10**9, 10**9 - 10, 10)
+    monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda folder: nearly_full)
+    with pytest.raises(ValueError, match=r"No space left on device: \S+ MB needed, 0\.0 MB free"):
+        saved.save(after(3), {})
+    assert saved.latest() == 2
 
 
 def test_all_damaged_is_one_clear_line(saved: Checkpoints) -> None:

@@ -80,6 +80,33 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--parts everything", "invalid choice 'everything'"),
         ("--out full", "--out full: exists"),
     ],
+    "replay": [
+        ("", "give --checkpoint"),
+        ("--checkpoint bare", "give --scene and --target, or --episode"),
+        ("--checkpoint nowhere --episode 3", "nowhere/config.json: no such file"),
+        ("--checkpoint bare --episode 3 --scene X", "--episode takes no --scene, --target or"),
+        ("--checkpoint bare --scene FloorPlan1 --target Mug", "bare/checkpoints: no checkpoint"),
+        ("--checkpoint bare --episode x", "invalid literal for int() with base 10: 'x'"),
+    ],
+    "trajectories": [
+        ("", "give --checkpoint"),
+        ("--checkpoint bare", "give --scene and --target, or --episode"),
+        ("--checkpoint binary --episode 3", "binary/config.json: 'utf-8' codec can't decode"),
+    ],
+    "attention": [
+        ("", "Missing from attention: --checkpoint"),
+        ("--checkpoint bare --scene FloorPlan1", "give --scene and --target, or --episode"),
+        ("--checkpoint bare", "bare/checkpoints: no checkpoint"),
+    ],
+    "sweep": [
+        ("", "Missing from sweep: --out"),
+        ("--out new --seed 3", "a sweep takes"),
+        ("--out new --splits 17/5", "--split 17/5: choose one of 22/0, 18/4, 14/8"),
+        ("--out new --stepz 5", "Unrecognized options: --stepz, 5"),
+        ("--out new --vmap-seeds --minutes 3", "--vmap-seeds needs a budget in --steps"),
+        ("--out new --report-only --steps 5", "--report-only trains nothing and takes no --steps"),
+        ("--out new --include full", "full"),
+    ],
     "scaling": [
         ("--rooms 10 0", "--rooms 0: must be positive"),
         ("--repeats=-1", "--repeats -1: must be positive"),
