@@ -144,7 +144,7 @@ FAULTS = (
 
 def passes(root: Path, tests: str) -> bool:
     """Whether the tests pass in a copy of the repository."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider"]
     environment = {**os.environ, "PYTHONPATH": str(root)}
     done = subprocess.run(
         [*command, *(f"tests/{name}" for name in tests.split())],

@@ -175,6 +175,7 @@ def flat(cases: dict[str, list[tuple[str, str]]]) -> list[tuple[str, str, str]]:
     return [(name, *case) for name, rows in cases.items() for case in rows]
 
 
+@pytest.mark.usefixtures("ithor")  # the rooms are there: no line about computing them
 @pytest.mark.parametrize(("name", "arguments", "message"), flat(CASES))
 def test_wrong_arguments_give_one_line_and_write_nothing(
     folder: Path, capsys: pytest.CaptureFixture[str], name: str, arguments: str, message: str
