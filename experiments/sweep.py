@@ -122,13 +122,11 @@ def train_all(
       configs: what to train.
     """
     from tdanet_jax import devices
-    from tdanet_jax.task import resolve_precision
+    from tdanet_jax.task import resolve
 
     devices.connect(training.devices)
     devices.keep_compiled()
-    configs = [
-        dataclasses.replace(config, network=resolve_precision(config.network)) for config in configs
-    ]
+    configs = [resolve(config) for config in configs]
     folders = [command.out / sweep.run_name(config) for config in configs]
     # All are looked at before the first trains: a clash shows at once, not after hours.
     states = [sweep.progress(*pair) for pair in zip(folders, configs, strict=True)]

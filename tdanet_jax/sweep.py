@@ -60,7 +60,7 @@ def progress(folder: Path, config: TrainConfig) -> Literal["new", "begun", "fini
     """How far the run of a configuration is.
 
     Args:
-      config: with the precision that it runs with, not `auto`.
+      config: as it runs, with no `auto` left (`task.resolve`).
 
     Raises:
       ValueError: the folder holds a run of another configuration; the message names the flags.
