@@ -65,6 +65,8 @@ class Command:
     """Numbers of networks that are evaluated in one call; 20 is a run's history."""
     checkpoint: Path | None = None
     """Run whose trained network the `evaluation` part plays; by default an untrained one."""
+    models: tuple[str, ...] = ("tdanet",)
+    """Models of the `decision` part; the other parts measure TDANet."""
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
     devices: int = 1
@@ -89,6 +91,8 @@ def main(arguments: list[str] | None = None) -> None:
             batches=command.batches,
             networks=command.networks,
         )
+        for name in command.models:
+            TrainConfig(model=name).check()
         rows = []
         for row in measure(command):
             rows.append(row)
@@ -136,8 +140,10 @@ def measure(command: Command) -> Iterator[Row]:
         for networks in command.networks:
             yield evaluation_row(command.checkpoint, task, networks, command.repeats)
     if "decision" in command.parts:
-        for count in (1, 1024):
-            yield decision_row(task, count, command.repeats)
+        for name in command.models:
+            task = load_task(TrainConfig(model=name, data=command.data))
+            for count in (1, 1024):
+                yield decision_row(task, name, count, command.repeats)
 
 
 def timed(call: Callable[[], Any], repeats: int, inner: int = 1) -> tuple[float, float]:
@@ -292,8 +298,8 @@ def environment_row(task: Task, count: int, observed: bool, repeats: int, mesh: 
     }
 
 
-def forward_macs(model: ActorCritic, words_width: int) -> int:
-    """Multiply-accumulates of one forward step, by the sizes of its layers.
+def tdanet_forward_macs(model: ActorCritic, words_width: int) -> int:
+    """Multiply-accumulates of one forward step of TDANet, by the sizes of its layers.
 
     What is done once per update for the table of classes is not counted.
     """
@@ -344,7 +350,7 @@ def update_row(task: Task, precision: str, count: int, peak: float | None, repea
     """Rollout, gradient and optimiser step, as the training command runs them."""
     model = with_precision(task, precision)
     row = update_cost(model, task.train_words, task.train_params, count, repeats)
-    by_hand = 6 * forward_macs(model, task.train_words.shape[1])
+    by_hand = 6 * tdanet_forward_macs(model, task.train_words.shape[1])
     gflops = by_hand * row["steps_per_second"] / 1e9
     return {
         "part": "update",
@@ -434,12 +440,12 @@ def evaluation_row(run: Path | None, task: Task, networks: int, repeats: int) ->
     }
 
 
-def decision_row(task: Task, count: int, repeats: int) -> Row:
-    """One decision: an observation in, action probabilities out."""
+def decision_row(task: Task, name: str, count: int, repeats: int) -> Row:
+    """One decision of an untrained model: an observation in, action probabilities out."""
     import jax
     import jax.numpy as jnp
 
-    from tdanet_jax import env
+    from tdanet_jax import env, parameters
     from tdanet_jax.models import actor_critic
 
     model = task.model
@@ -457,7 +463,9 @@ def decision_row(task: Task, count: int, repeats: int) -> Row:
     first, seconds = timed(lambda: decide(weights, table, carry, obs), 4 * repeats, inner=20)
     return {
         "part": "decision",
+        "model": name,
         "batch": count,
+        "parameters": parameters.count(model, *task.words.shape).trained,
         "compile_seconds": round(first - seconds, 2),
         "milliseconds": round(1e3 * seconds, 3),
     }
@@ -477,7 +485,8 @@ def as_table(rows: list[Row]) -> Table:
     """All rows as one table: the part, its setting, and its figures."""
     table = Table("part", "setting", "figures")
     settings = (
-        "environments", "devices", "observations", "precision", "batch", "networks", "episodes",
+        "environments", "devices", "observations", "precision", "model", "batch", "networks",
+        "episodes",
     )  # fmt: skip
     for row in rows:
         setting = ", ".join(f"{k} {row[k]}" for k in settings if k in row)

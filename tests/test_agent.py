@@ -1,5 +1,6 @@
 """A trained agent on its own: what it decides is what the network in the environment decides."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -13,13 +14,14 @@ import tdanet_jax
 from tdanet_jax import config as configs
 from tdanet_jax import env, history
 from tdanet_jax.agent import Agent, Detection
-from tdanet_jax.classes import Classes
+from tdanet_jax.classes import Classes, make_classes
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.history import Snapshot
 from tdanet_jax.models import actor_critic
 from tdanet_jax.reward import find_parents
 from tdanet_jax.task import make_model
 from tdanet_jax.vocabulary import TARGETS, Action
+from tests.models import samples
 
 CONFIG = TrainConfig(network=NetworkConfig(width=16, hidden=16, precision="float32"))
 
@@ -42,10 +44,11 @@ def detections_of(tables, pose):
     return [Detection(name, *map(float, box)) for name, box in zip(names, boxes, strict=True)]
 
 
-def test_it_decides_as_the_network_does_in_the_environment(agent, weights, some_rooms, glove):
+def decide_alike(agent, some_rooms, glove, merge):
+    """The agent and its network in the environment, side by side on a walk."""
     parents = find_parents(some_rooms, TARGETS)
-    params = env.make_params(some_rooms, TARGETS, parents, env.TEST_STEP_LIMITS, merge=False)
-    model = agent.model
+    params = env.make_params(some_rooms, TARGETS, parents, env.TEST_STEP_LIMITS, merge=merge)
+    model, weights = agent.model, agent.weights
     table = actor_critic.prepare(model, weights, jnp.asarray(glove.table(some_rooms.classes)))
     goal = some_rooms.targets.index("Mug")
     memory, carry, previous = agent.start(), model.initial_carry(1), jnp.zeros((1, 6))
@@ -60,6 +63,41 @@ def test_it_decides_as_the_network_does_in_the_environment(agent, weights, some_
         np.testing.assert_allclose(decision.probabilities, previous[0], rtol=1e-4)
         np.testing.assert_allclose(decision.value, out.value[0], rtol=1e-4, atol=1e-6)
         assert decision.action == Action(int(decision.probabilities.argmax()))
+
+
+def test_it_decides_as_the_network_does_in_the_environment(agent, some_rooms, glove):
+    decide_alike(agent, some_rooms, glove, merge=False)
+
+
+@pytest.fixture(scope="module")
+def row_agent(some_rooms, glove):
+    """An agent with a row per known class, and parameters that make every row matter."""
+    classes = make_classes(some_rooms.classes, {"Toaster", "Laptop", "Bread"})
+    config = dataclasses.replace(CONFIG, model="ssnet")
+    model = make_model(config, classes)
+    words = jnp.asarray(glove.table(some_rooms.classes))
+    weights = samples.randomised(model.initialise(jax.random.key(3), words))
+    return Agent(config, weights, glove, classes)
+
+
+def test_a_model_with_a_row_per_class_is_shown_what_it_was_in_training(
+    row_agent, some_rooms, glove
+):
+    decide_alike(row_agent, some_rooms, glove, merge=True)
+
+
+def test_a_model_with_a_row_per_class_sees_known_classes_alone_and_any_target(row_agent):
+    sink, mug = Detection("sink", 0.1, 0.1, 0.3, 0.4), Detection("mug", 0.5, 0.5, 0.6, 0.7)
+    others = [Detection(name, 0.0, 0.0, 1.0, 1.0) for name in ("toaster", "dog", "bread")]
+
+    def probabilities(seen, target):
+        return row_agent.act(row_agent.start(), seen, target)[1].probabilities
+
+    plain = probabilities([sink, mug], "toaster")
+    np.testing.assert_allclose(probabilities([mug, *others, sink], "toaster"), plain, rtol=1e-5)
+    assert np.abs(probabilities([sink], "toaster") - plain).max() > 1e-4
+    assert np.abs(probabilities([sink, mug], "dog") - plain).max() > 1e-4
+    assert row_agent.act(row_agent.start(), [sink], "mug")[1].attention is None
 
 
 def test_attention_sums_to_one_over_the_detections_and_none_is_fine(agent):

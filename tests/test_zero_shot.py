@@ -182,19 +182,25 @@ def test_perturbing_all_hidden_data_changes_nothing_that_training_reads(
     assert not np.array_equal(task.words, other.words)
 
 
+@pytest.mark.parametrize(
+    ("model", "paid"), [("tdanet", "parents"), ("ssnet", "similarity"), ("mjolnir-o", "parents")]
+)
 def test_perturbing_all_hidden_data_changes_no_parameter(
-    rooms: SceneTables, glove: WordVectors
+    rooms: SceneTables, glove: WordVectors, model: str, paid: Any
 ) -> None:
     config = config_of("18/4", False)
+    paying = dataclasses.replace(config.learner, partial_reward=paid)
+    config = dataclasses.replace(config, model=model, learner=paying)
     hidden = make_split("18/4").hidden
     noisy = perturbed(rooms, hidden, seed=2)
-    model = make_task(config, rooms, glove).model
-    chunk = learner.make_train(config.learner, model, 2)
+    network = make_task(config, rooms, glove).model
+    chunk = learner.make_train(config.learner, network, 2)
     states = []
     for tables, vectors in ((rooms, glove), (noisy, other_words(glove, hidden, rooms.classes))):
         task = make_task(config, tables, vectors)
+        assert task.model == network
         start = learner.init(
-            jax.random.key(3), config.learner, model, task.train_words, task.train_params
+            jax.random.key(3), config.learner, network, task.train_words, task.train_params
         )
         chunked = chunk(start, jnp.array([0.0, 0.1]), task.train_words, task.train_params)
         states.append(chunked)
@@ -240,6 +246,26 @@ def test_no_training_episode_shows_or_asks_for_a_hidden_class(
     assert not np.isin(params.target_class[params.pair_target], indices).any()
     assert not np.asarray(task.train_words)[indices].any()
     assert not hidden & {rooms.classes[i] for edge in task.classes.edges for i in edge[:2]}
+
+
+@pytest.mark.parametrize("model", ["ssnet", "mjolnir-o"])
+def test_no_hidden_class_has_a_row_or_a_node(
+    rooms: SceneTables, glove: WordVectors, model: str
+) -> None:
+    config = dataclasses.replace(config_of("18/4", False), model=model)
+    task = make_task(config, rooms, glove)
+    hidden = [rooms.classes.index(name) for name in make_split("18/4").hidden]
+    weights = jax.eval_shape(task.model.initialise, jax.random.key(0), task.words)
+    table = task.model.apply(
+        {"params": jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), weights)},
+        task.words,
+        method="prepare",
+    )
+    rows = table if model == "ssnet" else table.rows
+    count = len(rooms.classes) - len(hidden)
+    assert rows.cosine.shape == (len(rooms.classes), count)
+    assert (np.asarray(rows.row)[hidden] == count).all()
+    assert sorted(np.delete(rows.row, hidden)) == list(range(count))
 
 
 @pytest.mark.parametrize("split", SPLITS, ids=NAMES)

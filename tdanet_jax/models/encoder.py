@@ -7,6 +7,7 @@ environment, the update, the evaluation and every command then work with it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import jax
@@ -77,3 +78,12 @@ class Encoder(nn.Module, kw_only=True):
     def attend(self, table: Any, obs: Observation) -> jax.Array | None:
         """Attention over the detections, [..., K]; None if the model has none."""
         return None
+
+    def published_beside(self, width: int, inputs: int) -> Mapping[str, int]:
+        """Parameters that the published code has beside these, by name; negative where it has less.
+
+        Args:
+          width: of the word vectors.
+          inputs: of the LSTM.
+        """
+        return {}

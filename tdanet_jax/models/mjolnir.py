@@ -33,7 +33,7 @@ from tdanet_jax.env import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import Linear, product, recall, recorded
-from tdanet_jax.models.rows import COLUMNS, RowTable, class_rows, make_table
+from tdanet_jax.models.rows import COLUMNS, RowTable, class_rows, make_table, published_beside
 
 #: Units of a node behind the third convolution.
 NODE_UNITS = 5
@@ -169,6 +169,10 @@ class MjolnirOEncoder(Encoder):
         rows = class_rows(table.rows, obs)
         context = rows.reshape(*obs.empty.shape, -1)
         return jnp.concatenate([self.graph(table, rows), context], axis=-1)
+
+    def published_beside(self, width: int, inputs: int) -> dict[str, int]:
+        """Frozen word vectors and a layer without use; the adjacency is trained, as published."""
+        return published_beside(len(self.classes.known), width, inputs)
 
 
 def make(config: NetworkConfig, classes: Classes, dtype: Any) -> ActorCritic:

@@ -13,6 +13,7 @@ import numpy as np
 from flax import struct
 
 from tdanet_jax.env import Observation
+from tdanet_jax.vocabulary import NUM_ACTIONS
 
 #: present, x, y, S, cosine.
 COLUMNS = 5
@@ -45,3 +46,17 @@ def class_rows(table: RowTable, obs: Observation) -> jax.Array:
     boxes = blank.at[frame, row].set(seen.reshape(-1, slots, COLUMNS - 1), mode="drop")
     cosine = table.cosine[obs.target][..., None]
     return jnp.concatenate([boxes.reshape(*lead, n, COLUMNS - 1), cosine], axis=-1)
+
+
+def published_beside(classes: int, width: int, inputs: int) -> dict[str, int]:
+    """What the published code of MJOLNIR and SSNet counts beside the network.
+
+    Args:
+      classes: n.
+      width: of the word vectors.
+      inputs: of the LSTM.
+    """
+    return {
+        "word vectors, frozen": classes * width,
+        "a layer for pairs of states, unused": (2 * inputs + 1) * NUM_ACTIONS,
+    }

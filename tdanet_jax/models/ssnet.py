@@ -21,7 +21,8 @@ from tdanet_jax.env import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import recorded
-from tdanet_jax.models.rows import COLUMNS, RowTable, class_rows, make_table
+from tdanet_jax.models.rows import COLUMNS, RowTable, class_rows, make_table, published_beside
+from tdanet_jax.vocabulary import NUM_ACTIONS
 
 #: W_Q and W_K start as this times the unit matrix, W_V as the other, each with a little noise. From
 #: torch's small random start a row's attention is even over a hundred rows, all outputs are alike,
@@ -63,6 +64,14 @@ class SSNetEncoder(Encoder):
         found = recorded(self, "moments", lambda: moments(jax.lax.stop_gradient(mixing), rows))
         out = attend(mixing, rows, found) @ self.value
         return out.reshape(*obs.empty.shape, -1)
+
+    def published_beside(self, width: int, inputs: int) -> dict[str, int]:
+        """Frozen word vectors, and two layers without use."""
+        embedding = (NUM_ACTIONS + 1) * 10
+        return {
+            **published_beside(len(self.known), width, inputs),
+            "an embedding of actions, unused": embedding,
+        }
 
 
 def near_unit(key: jax.Array, scale: float) -> jax.Array:

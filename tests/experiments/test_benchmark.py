@@ -23,6 +23,15 @@ def test_it_writes_one_json_object_per_figure(ithor, tmp_path):
     assert all(row["steps_per_second"] > 0 for row in rows[1:])
 
 
+def test_decisions_of_any_model_are_timed(ithor, tmp_path):
+    out = tmp_path / "figures.jsonl"
+    arguments = ["--parts", "decision", "--models", "ssnet", "--repeats", "1", "--out"]
+    benchmark.main([*arguments, str(out)])
+    rows = [json.loads(line) for line in out.read_text().splitlines()][1:]
+    assert [(row["model"], row["batch"]) for row in rows] == [("ssnet", 1), ("ssnet", 1024)]
+    assert all(row["milliseconds"] > 0 and row["parameters"] > 2e6 for row in rows)
+
+
 def test_the_hand_formula_counts_the_kernels_that_a_step_uses():
     """All kernels but W_L's, which is used once per update for the table of classes."""
     network = NetworkConfig(width=32, hidden=48, precision="float32")
@@ -30,7 +39,7 @@ def test_the_hand_formula_counts_the_kernels_that_a_step_uses():
     weights = model.initialise(jax.random.key(0), jnp.ones((5, 50)))
     del weights["encoder"]["attention"]
     kernels = sum(leaf.size for leaf in jax.tree.leaves(weights) if leaf.ndim == 2)
-    assert benchmark.forward_macs(model, 50) == kernels
+    assert benchmark.tdanet_forward_macs(model, 50) == kernels
 
 
 def test_an_evaluation_plays_the_networks_of_a_run_in_one_call(ithor, tmp_path):
