@@ -143,7 +143,7 @@ def measure(command: Command) -> Iterator[Row]:
         for name in command.models:
             task = load_task(TrainConfig(model=name, data=command.data))
             for count in (1, 1024):
-                yield decision_row(task, name, count, command.repeats)
+                yield {**decision_row(task, count, command.repeats), "model": name}
 
 
 def timed(call: Callable[[], Any], repeats: int, inner: int = 1) -> tuple[float, float]:
@@ -440,7 +440,7 @@ def evaluation_row(run: Path | None, task: Task, networks: int, repeats: int) ->
     }
 
 
-def decision_row(task: Task, name: str, count: int, repeats: int) -> Row:
+def decision_row(task: Task, count: int, repeats: int) -> Row:
     """One decision of an untrained model: an observation in, action probabilities out."""
     import jax
     import jax.numpy as jnp
@@ -463,7 +463,6 @@ def decision_row(task: Task, name: str, count: int, repeats: int) -> Row:
     first, seconds = timed(lambda: decide(weights, table, carry, obs), 4 * repeats, inner=20)
     return {
         "part": "decision",
-        "model": name,
         "batch": count,
         "parameters": parameters.count(model, *task.words.shape).trained,
         "compile_seconds": round(first - seconds, 2),

@@ -233,18 +233,15 @@ def check_alike(runs: Sequence[Finished]) -> None:
 
 def costs(runs: Sequence[Finished]) -> dict[str, Cost]:
     """Parameters and inference time of every model among the runs, on this machine."""
-    import jax
-
     from tdanet_jax.task import load_task
 
     out: dict[str, Cost] = {}
     for run in runs:
         if run.config.model not in out:
             task = load_task(run.config)
-            shapes = jax.eval_shape(task.model.initialise, jax.random.key(0), task.words)
             rows = {batch: decision_row(task, batch, repeats=5) for batch in BATCHES}
             out[run.config.model] = Cost(
-                parameters=sum(leaf.size for leaf in jax.tree.leaves(shapes)),
+                parameters=rows[BATCHES[0]]["parameters"],
                 milliseconds={batch: row["milliseconds"] for batch, row in rows.items()},
             )
     return out

@@ -49,7 +49,8 @@ def count(model: ActorCritic, classes: int, width: int) -> Count:
     shapes = jax.eval_shape(model.initialise, jax.random.key(0), words)
     trained = sum(leaf.size for leaf in jax.tree.leaves(shapes))
     lstm = shapes["lstm"]
-    inputs = lstm["kernel"].shape[0] - model.hidden + lstm["kernel_aside"].shape[0]
+    inputs = lstm["kernel"].shape[0] - model.hidden
+    inputs += lstm["kernel_aside"].shape[0] if "kernel_aside" in lstm else 0
     return Count(trained, model.encoder.published_beside(width, inputs))
 
 
