@@ -61,7 +61,7 @@ def _unpack(x: jax.Array) -> jax.Array:
     return jax.lax.bitcast_convert_type(x, jnp.bfloat16) if x.dtype == jnp.uint16 else x
 
 
-def _transposed(kernel: jax.Array, dtype: Any) -> jax.Array:
+def own_transpose(kernel: jax.Array, dtype: Any) -> jax.Array:
     """kernel.T in `dtype`; where `_keeps_transposed`, as an array of its own.
 
     XLA folds a plain transpose into the product that reads it, and a loop's result it cannot fold.
@@ -154,7 +154,7 @@ def _recall_product_bwd(dtype: Any, saved: tuple, cotangent: jax.Array) -> tuple
     x, kernel, transposed = saved
     if transposed is None:
         return *_product_bwd(dtype, (x, kernel), cotangent), None, None
-    back = _transposed(kernel, dtype)
+    back = own_transpose(kernel, dtype)
 
     def body(grad_kernel: jax.Array, step: tuple) -> tuple[jax.Array, jax.Array]:
         x_t, cotangent_t = step
@@ -178,45 +178,6 @@ def recorded(module: nn.Module, name: str, compute: Callable[[], Any]) -> Any:
         module.put_variable(TAPE, name, value)
         return value
     return module.get_variable(TAPE, name) if module.has_variable(TAPE, name) else compute()
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def recall(function: Callable[[Any, Any], jax.Array], weights: Any, x: Any, value: Any) -> Any:
-    """`function(weights, x_t)` of every step of a rollout, where `value` is what it has given.
-
-    The backward pass goes through one step at a time and computes it again, so that nothing but
-    the results is kept of a function whose parts are large.
-
-    Args:
-      function: from the batch of one step to an array.
-      weights: arrays that get a gradient.
-      x: arrays [T, ...] that get none.
-      value: [T, ...], for one from `recorded`.
-    """
-    return value
-
-
-def _recall_fwd(
-    function: Callable[[Any, Any], jax.Array], weights: Any, x: Any, value: Any
-) -> tuple[Any, tuple]:
-    return value, (weights, x)
-
-
-def _recall_bwd(
-    function: Callable[[Any, Any], jax.Array], saved: tuple, cotangent: Any
-) -> tuple[Any, None, None]:
-    weights, x = saved
-
-    def body(total: Any, step: tuple) -> tuple[Any, None]:
-        x_t, cotangent_t = step
-        pull = jax.vjp(lambda weights: function(weights, x_t), weights)[1]
-        return jax.tree.map(jnp.add, total, pull(cotangent_t)[0]), None
-
-    zeros = jax.tree.map(jnp.zeros_like, weights)
-    return jax.lax.scan(body, zeros, (x, cotangent))[0], None, None
-
-
-recall.defvjp(_recall_fwd, _recall_bwd)
 
 
 class Linear(nn.Module):
@@ -402,7 +363,7 @@ def _recall_lstm_fwd(
 def _recall_lstm_bwd(dtype: Any, saved: tuple, cotangents: Carry) -> tuple:
     (kernel, kernel_aside, bias), carry, aside, fresh, (gates, cell, inputs) = saved
     before = jnp.concatenate([carry[1][None], cell[:-1]])  # the cell that each step started from
-    back = _transposed(kernel, dtype)  # [4 H, n + H]
+    back = own_transpose(kernel, dtype)  # [4 H, n + H]
     split = kernel.shape[0] - cell.shape[-1]  # n
 
     def body(grads: tuple, step: tuple) -> tuple[tuple, tuple]:

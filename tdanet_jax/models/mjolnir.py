@@ -18,7 +18,7 @@ nodes and units, so that either product of a convolution is one of two matrices.
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,11 +32,14 @@ from tdanet_jax.config import NetworkConfig
 from tdanet_jax.env import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.layers import Linear, product, recall, recorded
+from tdanet_jax.models.layers import Linear, own_transpose, product, recorded
 from tdanet_jax.models.rows import COLUMNS, RowTable, class_rows, make_table, published_beside
 
+#: Matrix units want sizes that this divides; zeros fill up what is missing.
+ROUND = 32
 #: Units of a node behind the third convolution.
 NODE_UNITS = 5
+HE_UNIFORM = nn.initializers.he_uniform()
 
 
 class Nodes(struct.PyTreeNode):
@@ -55,9 +58,11 @@ class GraphTable(struct.PyTreeNode):
 
 
 class Convolutions(struct.PyTreeNode):
-    """What the first three convolutions are made of."""
+    """What the first three convolutions are made of, padded with zeros to round sizes n and h."""
 
-    nodes: Nodes
+    words: jax.Array  # [n, h]
+    presence: jax.Array  # [n, h]
+    degree: jax.Array  # [n]
     adjacency: jax.Array  # [n, n]
     second: jax.Array  # [h, h], W1
     third: jax.Array  # [h, 5], W2
@@ -69,7 +74,7 @@ class Kernel(nn.Module):
     @nn.compact
     def __call__(self, rows: int, columns: int) -> jax.Array:
         """[rows, columns]."""
-        return self.param("kernel", nn.initializers.he_uniform(), (rows, columns))
+        return self.param("kernel", HE_UNIFORM, (rows, columns))
 
 
 class GraphEncoder(nn.Module):
@@ -88,7 +93,11 @@ class GraphEncoder(nn.Module):
     def setup(self) -> None:
         start = functools.partial(graph.normalised, self.classes)
         self.adjacency = self.param("adjacency", lambda _: jnp.asarray(start()))
-        self.kernels = [Kernel() for _ in range(4)]
+        self.kernels = [Kernel() for _ in range(3)]
+        # Not negative at first: hardly any of its inputs are, so that the sign of their sum, and
+        # whether the ReLU behind it lets anything through, would be an accident of the seed.
+        start_last = lambda key: abs(HE_UNIFORM(key, (NODE_UNITS + COLUMNS, 1)))  # noqa: E731
+        self.last = self.param("last", start_last)
         self.mapping = Linear(self.features)
 
     def prepare(self, words: jax.Array) -> GraphTable:
@@ -106,38 +115,130 @@ class GraphEncoder(nn.Module):
 
     def __call__(self, table: GraphTable, rows: jax.Array) -> jax.Array:
         """The features [..., H] of the context [..., n, 5]."""
-        width = table.nodes.words.shape[1]
+        count, width = table.nodes.words.shape
+        more_nodes, more_units = -count % ROUND, -width % ROUND
         weights = Convolutions(
-            nodes=table.nodes,
-            adjacency=self.adjacency,
-            second=self.kernels[1](width, width),
-            third=self.kernels[2](width, NODE_UNITS),
+            words=jnp.pad(table.nodes.words, ((0, more_nodes), (0, more_units))),
+            presence=jnp.pad(table.nodes.presence, ((0, more_nodes), (0, more_units))),
+            degree=jnp.pad(table.nodes.degree, (0, more_nodes)),
+            adjacency=jnp.pad(self.adjacency, (0, more_nodes)),
+            second=jnp.pad(self.kernels[1](width, width), (0, more_units)),
+            third=jnp.pad(self.kernels[2](width, NODE_UNITS), ((0, more_units), (0, 0))),
         )
-        present = rows[..., 0]
-        function = functools.partial(convolve, self.dtype)
-        nodes = recorded(self, "nodes", lambda: function(weights, present))
-        if present.ndim == 3:  # a rollout
-            nodes = recall(function, weights, present, nodes)
-        last = self.kernels[3](NODE_UNITS + COLUMNS, 1)
-        joined = jnp.concatenate([nodes, rows], axis=-1) @ last.astype(jnp.float32)
+        present = jnp.pad(rows[..., 0], ((0, 0),) * (rows.ndim - 2) + ((0, more_nodes),))
+        found = recorded(
+            self, "nodes", lambda: forward(jax.lax.stop_gradient(weights), present, self.dtype)
+        )
+        nodes = convolve(weights, present, self.dtype, found)[..., :count, :]
+        joined = jnp.concatenate([nodes, rows], axis=-1) @ self.last.astype(jnp.float32)
         return self.mapping(nn.relu(joined[..., 0] @ self.adjacency.astype(jnp.float32).T))
 
 
-def convolve(dtype: Any, weights: Convolutions, present: jax.Array) -> jax.Array:
-    """The first three convolutions of the presence [..., n]: [..., n, 5].
+class Layers(NamedTuple):
+    """The first three convolutions of a batch, layer by layer."""
+
+    first: jax.Array  # [n, B, h], behind A X W0 and ReLU
+    mixed: jax.Array  # [n, B, h], first W1
+    second: jax.Array  # [n, B, h], behind A mixed and ReLU
+    lower: jax.Array  # [n, 5 B], second W2
+    last: jax.Array  # [n, 5 B], A lower
+
+
+def layers_of(weights: Convolutions, present: jax.Array, dtype: Any) -> Layers:
+    """All layers of the presence [B, n], the large ones in `dtype`."""
+    count = present.shape[-1]
+    shared = present @ weights.presence  # [B, h]
+    first = nn.relu(weights.degree[:, None, None] * shared + weights.words[:, None]).astype(dtype)
+    mixed = product(first, weights.second, dtype).astype(dtype)
+    second = product(weights.adjacency, mixed.reshape(count, -1), dtype).reshape(first.shape)
+    second = nn.relu(second).astype(dtype)
+    lower = product(second, weights.third, dtype).reshape(count, -1)
+    return Layers(first, mixed, second, lower, weights.adjacency.astype(jnp.float32) @ lower)
+
+
+def forward(weights: Convolutions, present: jax.Array, dtype: Any) -> jax.Array:
+    """The first three convolutions of the presence [..., n]: [..., n, 5]."""
+    *lead, count = present.shape
+    last = nn.relu(layers_of(weights, present.reshape(-1, count), dtype).last)
+    return last.reshape(count, -1, NODE_UNITS).swapaxes(0, 1).reshape(*lead, count, NODE_UNITS)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def convolve(weights: Convolutions, present: jax.Array, dtype: Any, found: jax.Array) -> jax.Array:
+    """`forward(weights, present, dtype)`, which has given `found`; present [B, n] or [T, B, n].
+
+    The backward pass goes through one step at a time and computes its layers again, so that nothing
+    but the results is kept: those of a rollout would fill the memory.
+    """
+    return found
+
+
+def _convolve_fwd(
+    weights: Convolutions, present: jax.Array, dtype: Any, found: jax.Array
+) -> tuple[jax.Array, tuple[Convolutions, jax.Array]]:
+    return found, (weights, present)
+
+
+def _convolve_bwd(
+    dtype: Any, saved: tuple[Convolutions, jax.Array], cotangent: jax.Array
+) -> tuple[Convolutions, None, None]:
+    weights, present = saved
+    batch = present.shape[-2:]
+    back = own_transpose(weights.adjacency, dtype), own_transpose(weights.second, dtype)
+
+    def body(total: Convolutions, step: tuple) -> tuple[Convolutions, None]:
+        present, cotangent = step
+        found = gradient(weights, back, present, cotangent, dtype)
+        return jax.tree.map(jnp.add, total, found), None
+
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape), weights)
+    steps = present.reshape(-1, *batch), cotangent.reshape(-1, *batch, NODE_UNITS)
+    total = jax.lax.scan(body, zeros, steps)[0]
+    return jax.tree.map(lambda x, w: x.astype(w.dtype), total, weights), None, None
+
+
+convolve.defvjp(_convolve_fwd, _convolve_bwd)
+
+
+def gradient(
+    weights: Convolutions,
+    back: tuple[jax.Array, jax.Array],
+    present: jax.Array,
+    cotangent: jax.Array,
+    dtype: Any,
+) -> Convolutions:
+    """The gradient of `forward` in its weights, of one step.
 
     Args:
+      back: A and W1 transposed, as arrays of their own.
+      present: [B, n].
+      cotangent: [B, n, 5].
       dtype: operands of the large products.
     """
-    nodes, count = weights.nodes, present.shape[-1]
-    lead, batch = present.shape[:-1], present.reshape(-1, count)
-    shared = batch @ nodes.presence  # [B, h]
-    x = nn.relu(nodes.degree[:, None, None] * shared + nodes.words[:, None])  # [n, B, h]
-    x = product(x, weights.second, dtype)
-    x = nn.relu(product(weights.adjacency, x.reshape(count, -1), dtype).reshape(x.shape))
-    x = product(x, weights.third, dtype)  # [n, B, 5]
-    x = nn.relu(weights.adjacency.astype(jnp.float32) @ x.reshape(count, -1))
-    return x.reshape(count, -1, NODE_UNITS).swapaxes(0, 1).reshape(*lead, count, NODE_UNITS)
+    count = present.shape[-1]
+    at = layers_of(weights, present, dtype)
+    width = at.first.shape[-1]
+    shared = present @ weights.presence
+    last = jnp.where(at.last > 0, cotangent.swapaxes(0, 1).reshape(count, -1), 0.0)
+    lower = (weights.adjacency.astype(jnp.float32).T @ last).reshape(-1, NODE_UNITS)
+    second = lower @ weights.third.astype(jnp.float32).T
+    second = jnp.where(at.second.reshape(-1, width) > 0, second, 0.0).astype(dtype)
+    second = second.reshape(count, -1)
+    mixed = product(back[0], second, dtype).astype(dtype).reshape(-1, width)
+    # The first layer transposed is made anew, unit by unit: large transposed operands are slow.
+    turned = shared.T[:, None] * weights.degree[:, None] + weights.words.T[..., None]
+    first = product(mixed, back[1], dtype).reshape(at.first.shape)
+    first = jnp.where(at.first > 0, first, 0.0)
+    of_shared = jnp.einsum("nbh,n->bh", first, weights.degree)
+    adjacency = product(second, at.mixed.reshape(count, -1).T, dtype)
+    return Convolutions(
+        words=first.sum(axis=1),
+        presence=present.T @ of_shared,
+        degree=jnp.einsum("nbh,bh->n", first, shared),
+        adjacency=adjacency + last @ at.lower.T,
+        second=product(nn.relu(turned).astype(dtype).reshape(width, -1), mixed, dtype),
+        third=at.second.reshape(-1, width).T.astype(jnp.float32) @ lower,
+    )
 
 
 class MjolnirOEncoder(Encoder):

@@ -47,7 +47,7 @@ def mjolnir_graph(
     for layer in ("kernels_0", "kernels_1", "kernels_2"):
         x = relu(xp, (a @ x) @ params[layer]["kernel"])
     x = xp.concatenate([x, rows], axis=1)  # [n, 10]
-    x = relu(xp, (a @ x) @ params["kernels_3"]["kernel"])[:, 0]
+    x = relu(xp, (a @ x) @ params["last"])[:, 0]
     return linear(params["mapping"], x)
 
 

@@ -105,7 +105,7 @@ def test_layers_and_their_sizes_and_the_graph_at_the_start() -> None:
             "kernels_0": {"kernel": (h, h)},
             "kernels_1": {"kernel": (h, h)},
             "kernels_2": {"kernel": (h, 5)},
-            "kernels_3": {"kernel": (10, 1)},
+            "last": (10, 1),
             "mapping": {"kernel": (n, H), "bias": (H,)},
         }
     }
