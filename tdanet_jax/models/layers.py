@@ -180,6 +180,15 @@ def recorded(module: nn.Module, name: str, compute: Callable[[], Any]) -> Any:
     return module.get_variable(TAPE, name) if module.has_variable(TAPE, name) else compute()
 
 
+def not_negative(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """The start of a kernel whose single output, of inputs that are not negative, meets a ReLU.
+
+    The sign of their sum, and with it whether the ReLU lets anything through, would otherwise be an
+    accident of the seed.
+    """
+    return abs(nn.initializers.he_uniform()(key, shape))
+
+
 class Linear(nn.Module):
     """A dense layer that can record its product on the tape, or take it from there."""
 

@@ -32,14 +32,13 @@ from tdanet_jax.config import NetworkConfig
 from tdanet_jax.env import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.layers import Linear, own_transpose, product, recorded
+from tdanet_jax.models.layers import Linear, not_negative, own_transpose, product, recorded
 from tdanet_jax.models.rows import COLUMNS, RowTable, class_rows, make_table, published_beside
 
 #: Matrix units want sizes that this divides; zeros fill up what is missing.
 ROUND = 32
 #: Units of a node behind the third convolution.
 NODE_UNITS = 5
-HE_UNIFORM = nn.initializers.he_uniform()
 
 
 class Nodes(struct.PyTreeNode):
@@ -74,7 +73,7 @@ class Kernel(nn.Module):
     @nn.compact
     def __call__(self, rows: int, columns: int) -> jax.Array:
         """[rows, columns]."""
-        return self.param("kernel", HE_UNIFORM, (rows, columns))
+        return self.param("kernel", nn.initializers.he_uniform(), (rows, columns))
 
 
 class GraphEncoder(nn.Module):
@@ -94,10 +93,7 @@ class GraphEncoder(nn.Module):
         start = functools.partial(graph.normalised, self.classes)
         self.adjacency = self.param("adjacency", lambda _: jnp.asarray(start()))
         self.kernels = [Kernel() for _ in range(3)]
-        # Not negative at first: hardly any of its inputs are, so that the sign of their sum, and
-        # whether the ReLU behind it lets anything through, would be an accident of the seed.
-        start_last = lambda key: abs(HE_UNIFORM(key, (NODE_UNITS + COLUMNS, 1)))  # noqa: E731
-        self.last = self.param("last", start_last)
+        self.last = self.param("last", not_negative, (NODE_UNITS + COLUMNS, 1))
         self.mapping = Linear(self.features)
 
     def prepare(self, words: jax.Array) -> GraphTable:

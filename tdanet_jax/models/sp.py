@@ -27,7 +27,7 @@ from tdanet_jax.env import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.image import DROPOUT_UNITS, ImageTable, ImageTrunk
-from tdanet_jax.models.layers import Linear, product
+from tdanet_jax.models.layers import Linear, not_negative, product
 
 
 class SceneTable(struct.PyTreeNode):
@@ -72,9 +72,7 @@ class ScenePriorsEncoder(Encoder):
         self.convolution_seen = Linear(self.width, kernel_init=init, use_bias=False)
         self.convolution_words = Linear(self.width, kernel_init=init, use_bias=False)
         self.kernel1 = self.param("kernel1", init, (self.width, self.width))
-        # Not negative at first: its inputs are not either, so that the sign of their sum, and with
-        # it whether the last ReLU lets anything through, would be an accident of the seed.
-        self.kernel2 = self.param("kernel2", lambda *given: abs(init(*given)), (self.width, 1))
+        self.kernel2 = self.param("kernel2", not_negative, (self.width, 1))
         self.mapping = Linear(self.features)
 
     def prepare(self, words: jax.Array) -> SceneTable:
