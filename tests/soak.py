@@ -86,10 +86,10 @@ def report(minutes: float, folder: Path, samples: np.ndarray) -> dict[str, Any]:
     }
 
 
-def soak(minutes: float, arguments: list[str]) -> dict[str, Any]:
-    """Trains in a folder that is thrown away, and reports."""
+def soak(minutes: float, arguments: list[str], out: Path | None = None) -> dict[str, Any]:
+    """Trains in `out`, or in a folder that is thrown away, and reports."""
     with tempfile.TemporaryDirectory() as folder:
-        run = Path(folder) / "run"
+        run = out or Path(folder) / "run"
         return report(minutes, run, train(minutes, run, arguments))
 
 
@@ -97,8 +97,9 @@ def main() -> None:
     """Runs the command; what it does not know goes to the training command."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--minutes", type=float, default=5.0, help="training time")
+    parser.add_argument("--out", type=Path, help="folder of the run, to keep it")
     known, rest = parser.parse_known_args()
-    print(json.dumps(soak(known.minutes, rest), indent=2))
+    print(json.dumps(soak(known.minutes, rest, known.out), indent=2))
 
 
 if __name__ == "__main__":
