@@ -66,7 +66,7 @@ class Command:
     checkpoint: Path | None = None
     """Run whose trained network the `evaluation` part plays; by default an untrained one."""
     models: tuple[str, ...] = ("tdanet",)
-    """Models of the `decision` part; the other parts measure TDANet."""
+    """Models of the `rollout`, `update` and `decision` parts."""
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
     devices: int = 1
@@ -130,20 +130,36 @@ def measure(command: Command) -> Iterator[Row]:
         for count in command.environments:
             for observed in (False, True):
                 yield environment_row(task, count, observed, command.repeats, mesh)
-    for precision in command.precisions:
-        for count in command.batches:
-            if "rollout" in command.parts:
-                yield rollout_row(task, precision, count, command.repeats)
-            if "update" in command.parts:
-                yield update_row(task, precision, count, peak, command.repeats)
     if "evaluation" in command.parts:
         for networks in command.networks:
             yield evaluation_row(command.checkpoint, task, networks, command.repeats)
+    for name in command.models:
+        for row in model_rows(command, name, peak):
+            yield {"part": row.pop("part"), "model": name, **row}
+
+
+def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]:
+    """What was asked for of a model: acting, updates, and one decision.
+
+    Args:
+      peak: of float32 products, GFLOP/s; None if it was not measured.
+    """
+    from tdanet_jax.task import load_task
+
+    for precision in command.precisions:
+        network = NetworkConfig(precision=precision)
+        task = load_task(TrainConfig(model=name, network=network, data=command.data))
+        for count in command.batches:
+            if "rollout" in command.parts:
+                yield {**rollout_row(task, count, command.repeats), "precision": precision}
+            if "update" in command.parts:
+                row = update_row(task, count, command.repeats)
+                share = share_of_peak(task, row, peak) if name == "tdanet" else {}
+                yield {**row, **share, "precision": precision}
     if "decision" in command.parts:
-        for name in command.models:
-            task = load_task(TrainConfig(model=name, data=command.data))
-            for count in (1, 1024):
-                yield {**decision_row(task, count, command.repeats), "model": name}
+        task = load_task(TrainConfig(model=name, data=command.data))
+        for count in (1, 1024):
+            yield decision_row(task, count, command.repeats)
 
 
 def timed(call: Callable[[], Any], repeats: int, inner: int = 1) -> tuple[float, float]:
@@ -312,13 +328,13 @@ def tdanet_forward_macs(model: ActorCritic, words_width: int) -> int:
     return encoder + action + lstm + hidden * (NUM_ACTIONS + 1)
 
 
-def rollout_row(task: Task, precision: str, count: int, repeats: int) -> Row:
+def rollout_row(task: Task, count: int, repeats: int) -> Row:
     """Acting alone: environment, network and what the gradient needs later."""
     import jax
 
     from tdanet_jax import learner
 
-    model, config = with_precision(task, precision), LearnerConfig(num_envs=count)
+    model, config = task.model, LearnerConfig(num_envs=count)
     state = learner.init(jax.random.key(0), config, model, task.train_words, task.train_params)
 
     @jax.jit
@@ -331,31 +347,23 @@ def rollout_row(task: Task, precision: str, count: int, repeats: int) -> Row:
     first, seconds = timed(call, repeats, inner=5)
     return {
         "part": "rollout",
-        "precision": precision,
         "environments": count,
         "compile_seconds": round(first - seconds, 2),
         "steps_per_second": round(count * config.rollout_steps / seconds),
     }
 
 
-def with_precision(task: Task, precision: str) -> ActorCritic:
-    """TDANet with the given operands of the products."""
-    from tdanet_jax.task import make_model
-
-    network = NetworkConfig(precision=precision)  # type: ignore[arg-type]
-    return make_model(TrainConfig(network=network), task.classes)
-
-
-def update_row(task: Task, precision: str, count: int, peak: float | None, repeats: int) -> Row:
+def update_row(task: Task, count: int, repeats: int) -> Row:
     """Rollout, gradient and optimiser step, as the training command runs them."""
-    model = with_precision(task, precision)
-    row = update_cost(model, task.train_words, task.train_params, count, repeats)
-    by_hand = 6 * tdanet_forward_macs(model, task.train_words.shape[1])
-    gflops = by_hand * row["steps_per_second"] / 1e9
+    cost = update_cost(task.model, task.train_words, task.train_params, count, repeats)
+    return {"part": "update", **cost}
+
+
+def share_of_peak(task: Task, update: Row, peak: float | None) -> Row:
+    """Operations of TDANet's update by hand formula, and their share of the peak."""
+    by_hand = 6 * tdanet_forward_macs(task.model, task.train_words.shape[1])
+    gflops = by_hand * update["steps_per_second"] / 1e9
     return {
-        "part": "update",
-        "precision": precision,
-        **row,
         "megaflop_per_step_by_hand": round(by_hand / 1e6, 2),
         "gflops": round(gflops, 1),
         "share_of_float32_peak": round(gflops / peak, 3) if peak else None,
