@@ -4,10 +4,6 @@ As in the published code: a node of the class graph is [what the frame shows, th
 vector], the former the same for all nodes; three graph convolutions give one number per node, and a
 linear map of these joins the image's features. What the frame shows are a frozen ResNet's scores of
 1,000 classes; here, which of the known classes the raster holds.
-
-Equal forms, held equal by a test: the part of the first layer that is the same for all nodes is
-taken once per frame, the words' part once per parameter change, and the graph is applied behind a
-layer where that is less work.
 """
 
 from __future__ import annotations
@@ -24,10 +20,12 @@ from tdanet_jax import graph
 from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig
 from tdanet_jax.env import Observation
+from tdanet_jax.models import convolutions
 from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.convolutions import Convolutions
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.image import DROPOUT_UNITS, ImageTable, ImageTrunk
-from tdanet_jax.models.layers import Linear, not_negative, product
+from tdanet_jax.models.layers import Linear, not_negative
 
 
 class SceneTable(struct.PyTreeNode):
@@ -91,37 +89,16 @@ class ScenePriorsEncoder(Encoder):
         cells = table.node[obs.cells].reshape(*obs.cells.shape[:-2], -1)  # -1: no class, no node
         seen = (cells[..., None] == jnp.arange(len(self.known))).any(axis=-2)
         frame = self.convolution_seen(self.seen(seen.astype(jnp.float32)))  # [..., width]
-        weights = jnp.asarray(self.adjacency), table.nodes, self.kernel1, self.kernel2
-        if frame.ndim == 2:
-            scores = propagate(weights, frame, self.dtype)
-        else:
-            # One step at a time, and again in the backward pass: the nodes' layers of a whole
-            # rollout would fill the memory.
-            step = jax.checkpoint(lambda frame: propagate(weights, frame, self.dtype))
-            scores = jax.lax.map(step, frame)
+        adjacency = jnp.asarray(self.adjacency)
+        weights = Convolutions(
+            words=table.nodes,
+            degree=adjacency.sum(axis=1),
+            adjacency=adjacency,
+            second=self.kernel1,
+            third=self.kernel2,
+        )
+        scores = convolutions.apply(self, weights, frame, self.dtype)[..., 0]
         return jnp.concatenate([image, self.mapping(scores)], axis=-1)
-
-
-def propagate(weights: tuple[jax.Array, ...], frame: jax.Array, dtype: Any) -> jax.Array:
-    """The graph convolutions: relu(A X W) three times.
-
-    Args:
-      weights: A [n, n]; the first layer's A X W as far as it comes from words [n, width]; the
-        kernels of the second and third layer.
-      frame: [B, width], the first layer's X W as far as it comes from the frame.
-      dtype: operands of the large products.
-
-    Returns:
-      [B, n], a number per node.
-    """
-    adjacency, nodes, kernel1, kernel2 = weights
-    count, batch = adjacency.shape[0], frame.shape[0]
-    degree = adjacency.sum(axis=1)[:, None, None]
-    first = nn.relu(degree * frame + nodes[:, None])  # [n, B, width]
-    mixed = product(adjacency, first.reshape(count, -1), dtype).reshape(first.shape)
-    second = nn.relu(product(mixed, kernel1, dtype))
-    last = nn.relu(adjacency @ product(second, kernel2, jnp.float32).reshape(count, batch))
-    return last.T
 
 
 def make(config: NetworkConfig, classes: Classes, dtype: Any, width: int = 1024) -> ActorCritic:
