@@ -27,14 +27,19 @@ from tdanet_jax.words import WordVectors
 settings.register_profile("tests", deadline=None, derandomize=True, database=None)
 settings.load_profile("tests")
 
-# What one test or command has compiled, the next one need not: for this session alone.
-_compiled = tempfile.TemporaryDirectory(prefix="tdanet-compiled-")
-for _name, _value in {
-    "jax_compilation_cache_dir": _compiled.name,
-    "jax_persistent_cache_min_compile_time_secs": 0.5,
+# What one test or command has compiled, the next one need not, in whichever process: for this
+# session alone. The workers of pytest-xdist inherit the folder; a limit of its size brings locks.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    _compiled = tempfile.TemporaryDirectory(prefix="tdanet-compiled-")
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _compiled.name
+    os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(2**31)
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
+for _name, _convert in {
+    "jax_compilation_cache_dir": str,
+    "jax_compilation_cache_max_size": int,
+    "jax_persistent_cache_min_compile_time_secs": float,
 }.items():
-    jax.config.update(_name, _value)
-    os.environ[_name.upper()] = str(_value)  # for the commands that tests start
+    jax.config.update(_name, _convert(os.environ[_name.upper()]))
 
 #: Two rooms of each type. Parts of FloorPlan29, 204 and 229 cannot be reached from the others.
 SOME_ROOMS = (
