@@ -139,6 +139,15 @@ FAULTS = (
           "experiments/test_arguments.py"),
     Fault("starts drawn anywhere", "episodes.py", "valid = positions[reachable[positions, goal]]",
           "valid = positions", "test_episodes.py"),
+    Fault("padding has a row", "models/rows.py", "jnp.where(obs.mask, table.row[obs.classes], n)",
+          "table.row[obs.classes]", "models/test_ssnet.py"),
+    Fault("no gradient from what nodes share", "models/convolutions.py",
+          'degree=jnp.einsum("nbh,bh->n", first, shared)', "degree=0 * weights.degree",
+          "models/test_mjolnir.py"),
+    Fault("inner steps uphill", "models/adaptation.py", "-model.rate * product_grad",
+          "model.rate * product_grad", "models/test_adaptation.py"),
+    Fault("any pickled name", "untrusted/pickles.py", "if name not in _ALLOWED and",
+          "if False and", "untrusted/test_pickles.py"),
 )  # fmt: skip
 
 
