@@ -24,6 +24,7 @@ from experiments import evaluate as evaluating
 from experiments import train_zero_shot
 from tdanet_jax import assets, evaluation, files, task
 from tdanet_jax.checkpoint import Checkpoints
+from tdanet_jax.scenes import cache
 from tdanet_jax.training import METRICS_FILE, Journal, Run, read_metrics
 from tests.experiments import command
 from tests.test_checkpoint import flip, halve
@@ -278,3 +279,25 @@ def test_a_disk_that_is_really_full_and_one_that_is_read_only(small_disk: Path) 
         assert done.returncode == 2
         assert "Read-only file system" in done.stderr
         assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_damaged_compiled_programs_are_compiled_again(ithor, tmp_path: Path) -> None:
+    home = tmp_path / "cache"
+    said = []
+    for name in ("sound", "damaged"):
+        variables = {cache.VARIABLE: str(home)}
+        done = command.run("train_zero_shot", *SHORT, "--out", tmp_path / name, variables=variables)
+        assert done.returncode == 0, done.stderr
+        said.append(done.stderr.splitlines())
+        programs = list((home / "compiled").glob("*-cache"))
+        assert programs
+        for i, path in enumerate(programs):
+            (flip if i % 2 else halve)(path)
+    assert said[0] == []
+    assert said[1]
+    assert all(line.startswith("warning: Error reading") for line in said[1])
+    rows = [read_metrics(tmp_path / name) for name in ("sound", "damaged")]
+    for row in rows[0] + rows[1]:
+        del row["seconds"], row["steps_per_second"]
+    assert rows[0] == rows[1]
