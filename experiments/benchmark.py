@@ -13,12 +13,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import os
 import platform
 import statistics
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from rich.table import Table
 
@@ -36,24 +37,16 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 Part = Literal[
-    "tables", "import", "machine", "environment", "rollout", "update", "evaluation", "decision"
-]
+    "tables", "import", "startup", "machine", "environment", "rollout", "update", "evaluation",
+    "decision",
+]  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
     """Measures env, rollout, update, evaluation and one decision on this machine."""
 
-    parts: tuple[Part, ...] = (
-        "tables",
-        "import",
-        "machine",
-        "environment",
-        "rollout",
-        "update",
-        "evaluation",
-        "decision",
-    )
+    parts: tuple[Part, ...] = get_args(Part)
     """What to measure."""
     environments: tuple[int, ...] = (1024, 4096, 16384)
     """Numbers of environments in the `environment` part."""
@@ -121,6 +114,8 @@ def measure(command: Command) -> Iterator[Row]:
     task = load_task(TrainConfig(data=command.data))
     if "import" in command.parts:
         yield import_row(task)
+    if "startup" in command.parts:
+        yield startup_row()
     peak = None
     if "machine" in command.parts:
         machine = machine_row(command.repeats)
@@ -240,6 +235,41 @@ def import_row(task: Task) -> Row:
         "import_seconds": round(read - written, 2),
         "peak_memory_gb": round(peak / 1e9, 2),
     }
+
+
+def startup_row() -> Row:
+    """From typing the training command to its first update, the rooms' tables being cached: with
+    nothing compiled, and with the compiled programs of the first start; and `--help`."""
+    import shutil
+    import subprocess
+    import sys
+    import tempfile
+
+    from tdanet_jax.scenes import cache
+
+    train = [sys.executable, "-m", "experiments.train_zero_shot"]
+    row: Row = {"part": "startup"}
+    with tempfile.TemporaryDirectory() as place:
+        home = Path(place)
+        for path in cache.folder().glob(f"ithor-{cache.key()}.*"):
+            shutil.copy(path, home)
+        for name in ("nothing_compiled", "compiled_before"):
+            metrics = home / name / "metrics.jsonl"
+            began = time.perf_counter()
+            with subprocess.Popen(
+                [*train, "--chunk-updates", "1", "--out", str(metrics.parent)],
+                env=os.environ | {cache.VARIABLE: str(home)},
+                stdout=subprocess.DEVNULL,
+            ) as process:
+                while not metrics.exists():
+                    if process.poll() is not None:
+                        raise RuntimeError("startup: the training command ended early")
+                    time.sleep(0.01)
+                row[f"seconds_{name}"] = round(time.perf_counter() - began, 2)
+                process.kill()
+    began = time.perf_counter()
+    subprocess.run([*train, "--help"], check=True, stdout=subprocess.DEVNULL)
+    return row | {"seconds_help": round(time.perf_counter() - began, 2)}
 
 
 def machine_row(repeats: int) -> Row:

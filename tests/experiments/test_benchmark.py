@@ -4,6 +4,7 @@ import json
 
 import jax
 import jax.numpy as jnp
+import pytest
 
 from experiments import benchmark
 from tdanet_jax.classes import Classes
@@ -21,6 +22,14 @@ def test_it_writes_one_json_object_per_figure(ithor, tmp_path):
     assert [row["part"] for row in rows] == ["start", "environment", "environment"]
     assert [row.get("observations") for row in rows] == [None, False, True]
     assert all(row["steps_per_second"] > 0 for row in rows[1:])
+
+
+@pytest.mark.slow
+def test_a_second_start_finds_what_the_first_has_compiled(ithor, tmp_path):
+    out = tmp_path / "figures.jsonl"
+    benchmark.main(["--parts", "startup", "--out", str(out)])
+    row = json.loads(out.read_text().splitlines()[-1])
+    assert 0 < row["seconds_compiled_before"] < row["seconds_nothing_compiled"]
 
 
 def test_decisions_of_any_model_are_timed(ithor, tmp_path):
