@@ -20,10 +20,12 @@ MODELS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "tdanet-no-ta-sa": ("tdanet_jax.models.tdanet", {"target_attention": False, "siamese": False}),
     "ssnet": ("tdanet_jax.models.ssnet", {}),
     "mjolnir-o": ("tdanet_jax.models.mjolnir", {}),
+    "mjolnir-r": ("tdanet_jax.models.mjolnir", {"image": True}),
     "baseline": ("tdanet_jax.models.baseline", {}),
     "sp": ("tdanet_jax.models.sp", {"width": 256}),
     "sp-wide": ("tdanet_jax.models.sp", {"width": 1024}),
     "savn": ("tdanet_jax.models.savn", {}),
+    "li": ("tdanet_jax.models.li", {}),
 }
 #: Name of the file in a run's folder that holds its configuration.
 CONFIG_FILE = "config.json"
@@ -106,9 +108,10 @@ class TrainConfig:
     model: str = "tdanet"
     """The model to train: tdanet, one of its ablations (tdanet-no-ta without target attention,
     tdanet-no-sa without the Siamese comparison, tdanet-no-ta-sa without either), ssnet, mjolnir-o,
-    baseline (an image and an LSTM), sp (the baseline with scene priors; sp-wide in the published
-    size), savn (the baseline, which goes on learning while it acts), or the dotted name of a module
-    of your own that has a function `make`."""
+    mjolnir-r (the same with an image), baseline (an image and an LSTM), sp (the baseline with scene
+    priors; sp-wide in the published size), savn (the baseline, which goes on learning while it
+    acts), li (mjolnir-o, which does so, too), or the dotted name of a module of your own that has a
+    function `make` (docs/models.md)."""
     steps: int = 12_000_000
     """Budget in environment steps (actions)."""
     episodes: int | None = None

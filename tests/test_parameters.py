@@ -36,6 +36,11 @@ def test_the_published_counts_by_hand():
     graph = 101 * 101 + 2 * 401 * 401 + 401 * 5 + 10 + 101 * 512 + 512
     mjolnir = graph + action + lstm(inputs) + heads + (2 * inputs * 6 + 6) + 101 * 300
     assert parameters.as_published("mjolnir-o").published == mjolnir == 3_588_301
+    inputs = 7 * 7 * 64 + 512
+    image = 512 * 64 + 64 + 300 * 64 + 64 + 138 * 64 + 64
+    resnet = 512 * 1000 + 1000
+    mjolnir = image + graph + action + lstm(inputs) + heads + (2 * inputs * 6 + 6) + 101 * 300
+    assert parameters.as_published("mjolnir-r").published == mjolnir + resnet
 
 
 @pytest.mark.parametrize("name", MODELS)

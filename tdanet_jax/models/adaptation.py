@@ -13,8 +13,9 @@ respect to the product, so that
 
 and an environment keeps the pairs (x_t, d_t) of its inner steps instead of a matrix. For the small
 dense layers around the LSTM it keeps its own part of the parameters as it is (`layers.OWN`).
-What an encoder takes once for all environments (`prepare`), and dense layers of over 65,536
-weights, are not adapted; in SAVN there are none. A test compares with plain per-environment
+What an encoder takes once for all environments (`prepare`), layers that it shares among them
+(`Encoder.SHARED`), and dense layers of over 65,536 weights, are not adapted; SAVN has none of the
+latter two. A test compares with plain per-environment
 parameters, in value and in gradient.
 
 In training, all environments take their inner steps together, after every k steps of a rollout: an
@@ -191,7 +192,9 @@ class AdaptiveActorCritic(ActorCritic):
             count=jnp.zeros(batch, jnp.int32),
             own=jax.tree.map(
                 lambda x: jnp.zeros((batch, *x.shape)),
-                small({name: weights[name] for name in PARTS if name in weights}),
+                small(
+                    {name: weights[name] for name in PARTS if name in weights}, self.encoder.SHARED
+                ),
             ),
             pairs=Pairs(jnp.zeros((batch, pairs, kernel)), jnp.zeros((batch, pairs, gates))),
             steps=Steps(
@@ -418,11 +421,17 @@ def aside_kernel(lstm: Any) -> jax.Array:
     return kernel
 
 
-def small(weights: Any) -> Any:
-    """The dense layers among these that are small enough for every environment to have its own."""
+def small(weights: Any, shared: tuple[str, ...]) -> Any:
+    """The dense layers among these that are small enough for every environment to have its own.
+
+    Args:
+      weights: parameters by name.
+      shared: names of layers that are left out.
+    """
     if "kernel" in weights:
         return weights if weights["kernel"].size <= SMALL else {}
-    parts = {name: small(value) for name, value in weights.items() if isinstance(value, Mapping)}
+    layers = {name: w for name, w in weights.items() if isinstance(w, Mapping)}
+    parts = {name: small(w, shared) for name, w in layers.items() if name not in shared}
     return {name: part for name, part in parts.items() if part}
 
 

@@ -28,6 +28,8 @@ class Encoder(nn.Module, kw_only=True):
       ACTION: how the previous step's action probabilities enter. "embedded": through a layer of
         ten units, into the LSTM. "plain": as they are, into the LSTM. "inside": through the same
         layer, into the encoder alone.
+      SHARED: names of its layers that no environment adapts for itself, where the network adapts
+        (`tdanet_jax.models.adaptation`).
     """
 
     dropout: float = 0.0
@@ -36,6 +38,7 @@ class Encoder(nn.Module, kw_only=True):
     ROWS: ClassVar[Literal["class"] | None] = None
     IMAGE: ClassVar[bool] = False
     ACTION: ClassVar[Literal["embedded", "plain", "inside"]] = "embedded"
+    SHARED: ClassVar[tuple[str, ...]] = ()
 
     @property
     def dropout_units(self) -> int:

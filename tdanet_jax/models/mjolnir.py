@@ -6,7 +6,8 @@ context (present, x, y, S, cosine to the target) joins them, a fourth makes one 
 and a linear layer maps those of all nodes to the features. The adjacency starts as the class graph
 (`tdanet_jax.graph`) and is trained, as in the published code.
 
-MJOLNIR-o adds the context itself. MJOLNIR-r adds the image in its place.
+MJOLNIR-o adds the context itself. MJOLNIR-r adds in its place the baseline's features of the image,
+in which the previous action probabilities enter; the context enters through the graph alone.
 
 The first three convolutions are those of `convolutions.py`: what the nodes share is the presence,
 the sum of the first kernel's rows of the classes in the frame.
@@ -26,16 +27,28 @@ from flax import struct
 from tdanet_jax import graph
 from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.env import Observation
+from tdanet_jax.env import FEATURES, Observation
 from tdanet_jax.models import convolutions
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.convolutions import Convolutions
 from tdanet_jax.models.encoder import Encoder
+from tdanet_jax.models.image import CHANNELS, DROPOUT_UNITS, ImageTable, ImageTrunk
 from tdanet_jax.models.layers import Linear, not_negative
-from tdanet_jax.models.rows import COLUMNS, RowTable, class_rows, make_table, published_beside
+from tdanet_jax.models.rows import (
+    COLUMNS,
+    RowTable,
+    class_rows,
+    make_table,
+    published_beside,
+    rows_alone,
+)
 
 #: Units of a node behind the third convolution.
 NODE_UNITS = 5
+#: The names of the first three convolutions' kernels, which all environments share.
+KERNELS = ("kernels_0", "kernels_1", "kernels_2")
+#: Classes that ResNet-18 scores.
+RESNET_CLASSES = 1000
 
 
 class Nodes(struct.PyTreeNode):
@@ -124,6 +137,7 @@ class MjolnirOEncoder(Encoder):
     dtype: Any = jnp.float32
 
     ROWS = "class"
+    SHARED = KERNELS
 
     def setup(self) -> None:
         self.graph = GraphEncoder(self.classes, self.features, self.dtype)
@@ -144,8 +158,74 @@ class MjolnirOEncoder(Encoder):
         """Frozen word vectors and a layer without use; the adjacency is trained, as published."""
         return published_beside(len(self.classes.known), width, inputs)
 
+    def view(self, obs: Observation) -> Observation:
+        """The known classes and the target."""
+        return rows_alone(obs, self.classes.known)
 
-def make(config: NetworkConfig, classes: Classes, dtype: Any) -> ActorCritic:
-    """MJOLNIR-o with a node per class that training may know."""
-    encoder = MjolnirOEncoder(classes=classes, features=config.width, dtype=dtype)
+
+class MjolnirREncoder(Encoder):
+    """MJOLNIR-r: the features of the image and of the graph.
+
+    Attributes:
+      classes: the vocabulary.
+      features: units of the graph's features.
+      dropout: share of units that is dropped in training, in the image trunk; published: 0.25.
+      dtype: operands of the large products.
+    """
+
+    classes: Classes
+    features: int = 512
+    dtype: Any = jnp.float32
+
+    ROWS = "class"
+    IMAGE = True
+    ACTION = "inside"
+
+    @property
+    def dropout_units(self) -> int:
+        """The units of the trunk."""
+        return DROPOUT_UNITS
+
+    def setup(self) -> None:
+        self.trunk = ImageTrunk(self.maps, self.dropout, self.dtype)
+        self.graph = GraphEncoder(self.classes, self.features, self.dtype)
+
+    def prepare(self, words: jax.Array) -> tuple[ImageTable, GraphTable]:
+        """The tables of trunk and graph, from word vectors [C, D]."""
+        return self.trunk.prepare(words), self.graph.prepare(words)
+
+    def __call__(
+        self,
+        table: tuple[ImageTable, GraphTable],
+        obs: Observation,
+        action: jax.Array,
+        keep: jax.Array | None = None,
+    ) -> jax.Array:
+        """The features of a batch of observations, [..., 3136 + H]."""
+        image = self.trunk(table[0], obs, action, keep)
+        graph_features = self.graph(table[1], class_rows(table[1].rows, obs))
+        return jnp.concatenate([image, graph_features], axis=-1)
+
+    def published_beside(self, width: int, inputs: int) -> dict[str, int]:
+        """What stands beside MJOLNIR-o, a layer of ResNet-18, and the channels of zeros."""
+        channels = FEATURES[-1]
+        return {
+            **published_beside(len(self.classes.known), width, inputs),
+            "ResNet-18's scores, unused": (channels + 1) * RESNET_CLASSES,
+            "the convolution's zero channels": 0 if self.maps else (channels - width) * CHANNELS,
+        }
+
+
+def make(config: NetworkConfig, classes: Classes, dtype: Any, image: bool = False) -> ActorCritic:
+    """MJOLNIR with a node per class that training may know: MJOLNIR-r with `image`, else -o."""
+    if image:
+        encoder: Encoder = MjolnirREncoder(
+            classes=classes,
+            features=config.width,
+            dropout=config.dropout,
+            maps=config.image == "features",
+            dtype=dtype,
+        )
+    else:
+        encoder = MjolnirOEncoder(classes=classes, features=config.width, dtype=dtype)
     return ActorCritic(encoder, hidden=config.hidden, dtype=dtype)

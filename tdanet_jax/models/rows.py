@@ -48,6 +48,22 @@ def class_rows(table: RowTable, obs: Observation) -> jax.Array:
     return jnp.concatenate([boxes.reshape(*lead, n, COLUMNS - 1), cosine], axis=-1)
 
 
+def rows_alone(obs: Observation, known: tuple[int, ...]) -> Observation:
+    """The observations' target and a slot per known class, of one detection per class.
+
+    A class has its slot whether it is in view or not, so that all frames have the same shapes.
+    """
+    classes = jnp.array(known, jnp.int32)
+    here = obs.mask[..., None, :] & (obs.classes[..., None, :] == classes[:, None])  # [..., n, K]
+    return obs.replace(
+        classes=jnp.broadcast_to(classes, here.shape[:-1]),
+        boxes=jnp.where(here[..., None], obs.boxes[..., None, :, :], 0.0).sum(axis=-2),
+        mask=here.any(axis=-1),
+        cells=None,
+        features=None,
+    )
+
+
 def published_beside(classes: int, width: int, inputs: int) -> dict[str, int]:
     """What the published code of MJOLNIR and SSNet counts beside the network.
 

@@ -57,6 +57,18 @@ def mjolnir_o(xp: Any, params: Params, rows: Array, words: Array, known: tuple[i
     return xp.concatenate([features, rows.reshape(-1)])
 
 
+def mjolnir_r(
+    xp: Any,
+    params: Params,
+    rows: Array,
+    words: Array,
+    known: tuple[int, ...],
+    image: Array,
+) -> Array:
+    """[3136 + H]: the features of the image, from `equations.image`, and of the graph."""
+    return xp.concatenate([image, mjolnir_graph(xp, params["graph"], rows, words, known)])
+
+
 def frames(obs: Any, words: Array) -> list[tuple[dict[int, Any], Array]]:
     """What is seen and the target's word vector, of each frame of a flat batch."""
     return [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import chex
@@ -78,18 +79,26 @@ def learned_loss(params: Any, record: jax.Array) -> jax.Array:
     return jnp.sqrt((x[0] ** 2).sum())
 
 
-def slow(params: Any, given: Any, first_order: bool) -> Output:
+def slow(
+    params: Any,
+    given: Any,
+    first_order: bool,
+    plain: ActorCritic = PLAIN,
+    shared: Sequence[str] = (),
+) -> Output:
     """One environment's rollout: all its parameters are its own, its gradients `jax.grad`'s.
 
     Args:
       given: what it is shown, [T, 1, ...].
+      plain: the network without adaptation.
+      shared: names of parameters and layers that are not adapted.
     """
     network = {name: value for name, value in params.items() if name != "learned_loss"}
-    theta, carry, count, outs = network, PLAIN.initial_carry(1), 0, []
+    theta, carry, count, outs = network, plain.initial_carry(1), 0, []
 
     def step(theta: Any, carry: Any, shown: Any) -> tuple[Any, Output]:
-        table = actor_critic.prepare(PLAIN, theta, WORDS)
-        return actor_critic.forward(PLAIN, theta, table, carry, *shown)
+        table = actor_critic.prepare(plain, theta, WORDS)
+        return actor_critic.forward(plain, theta, table, carry, *shown)
 
     def inner(theta: Any, carry: Any, stretch: list[Any]) -> jax.Array:
         record = []
@@ -116,15 +125,22 @@ def slow(params: Any, given: Any, first_order: bool) -> Output:
             at = jax.lax.stop_gradient((theta, before)) if first_order else (theta, before)
             grad = jax.grad(inner)(*at, stretch)
             due = ~fresh[1:].any() & (count < LIMIT)
-            theta = jax.tree.map(lambda p, g, d=due: jnp.where(d, p - RATE * g, p), theta, grad)
+            theta = jax.tree.map_with_path(
+                lambda path, p, g, d=due: (
+                    p
+                    if any(key.key in shared for key in path)
+                    else jnp.where(d, p - RATE * g, p)
+                ),
+                theta, grad,
+            )  # fmt: skip
             count = count + due
     return jax.tree.map(lambda *x: jnp.concatenate(x), *outs)
 
 
-def slow_rollout(params: Any, given: Any, first_order: bool = False) -> Output:
+def slow_rollout(params: Any, given: Any, first_order: bool = False, **network: Any) -> Output:
     """`slow` in every environment: [T, B, ...]."""
     each = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1)[:, :, None], given)  # [B, T, 1, ...]
-    out = jax.vmap(lambda given: slow(params, given, first_order))(each)
+    out = jax.vmap(lambda given: slow(params, given, first_order, **network))(each)
     return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), out)
 
 
@@ -155,8 +171,13 @@ def test_values_and_gradients_are_those_of_plain_per_environment_parameters(
     grad, out = jax.jit(jax.grad(fast, has_aux=True))(parameters())
     slow_grad, slow_out = jax.jit(jax.grad(plain, has_aux=True))(parameters())
     chex.assert_trees_all_close(out, slow_out, **CLOSE)
+    assert_gradients_close(grad, slow_grad)
+
+
+def assert_gradients_close(found: Any, expected: Any) -> None:
+    """Every parameter has a gradient, and the expected one as far as float32 tells."""
     for (path, mine), theirs in zip(
-        jax.tree.leaves_with_path(grad), jax.tree.leaves(slow_grad), strict=True
+        jax.tree.leaves_with_path(found), jax.tree.leaves(expected), strict=True
     ):
         if mine.size:
             scale = float(np.abs(theirs).max())

@@ -116,11 +116,15 @@ def test_no_array_of_a_model_is_empty(name: str) -> None:
 def test_every_named_model_is_made_and_answers(name: str) -> None:
     names = tuple(f"Class{i}" for i in range(samples.CLASSES))
     model = make_model(dataclasses.replace(SMALL, model=name), Classes(names, tuple(range(7))))
-    weights = model.initialise(jax.random.key(0), WORDS)
-    table = actor_critic.prepare(model, weights, WORDS)
-    obs = samples.observations(B)
-    state = model.initial_carry(B, weights), obs, jnp.zeros((B, 6)), jnp.ones(B, bool)
-    _, out = actor_critic.forward(model, weights, table, *state)
+
+    def answer(key: jax.Array) -> Any:
+        weights = model.initialise(key, WORDS)
+        table = actor_critic.prepare(model, weights, WORDS)
+        obs = samples.one_per_class(samples.observations(B))
+        state = model.initial_carry(B, weights), obs, jnp.zeros((B, 6)), jnp.ones(B, bool)
+        return actor_critic.forward(model, weights, table, *state)[1]
+
+    out = jax.jit(answer)(jax.random.key(0))
     assert out.logits.shape == (B, 6)
     assert np.isfinite(out.logits).all()
 

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import linen as nn
 
 from tdanet_jax import graph
 from tdanet_jax.classes import Classes
 from tdanet_jax.env import Observation
+from tdanet_jax.models.image import CELLS, CHANNELS, DROPOUT_UNITS
 from tdanet_jax.models.layers import TAPE
-from tdanet_jax.models.mjolnir import MjolnirOEncoder
+from tdanet_jax.models.mjolnir import MjolnirOEncoder, MjolnirREncoder
 from tests.models import class_equations, equations, samples
 from tests.models.samples import CLASSES, WIDTH
 
@@ -130,3 +132,74 @@ def test_blind_to_classes_that_it_does_not_know() -> None:
     other = obs.replace(boxes=jnp.where(unknown[..., None], noise, obs.boxes))
     assert (np.asarray(other.boxes) != obs.boxes).any()
     chex.assert_trees_all_equal(features(parameters(), obs), features(parameters(), other))
+
+
+class Case(NamedTuple):
+    """MJOLNIR-r with random parameters, and frames [2, 2] for it."""
+
+    encoder: MjolnirREncoder
+    params: Any
+    obs: Observation
+    action: jax.Array
+    keep: jax.Array | None
+
+
+def image_case(maps: bool, training: bool) -> Case:
+    module = MjolnirREncoder(classes=VOCABULARY, features=H, dropout=0.25, maps=maps)
+    rng, obs = np.random.default_rng(7), observations(2, 2)
+    action = jnp.asarray(rng.normal(size=(2, 2, 10)), jnp.float32)
+    keep = jnp.asarray(rng.random((2, 2, DROPOUT_UNITS)) < 0.75) if training else None
+
+    def both(module: MjolnirREncoder) -> jax.Array:
+        return module(module.prepare(WORDS), *jax.tree.map(lambda x: x[0], (obs, action)))
+
+    params = samples.randomised(jax.jit(nn.init(both, module))(jax.random.key(0))["params"])
+    return Case(module, params, obs, action, keep)
+
+
+def published(xp: Any, case: Case, params: Any, words: Any) -> Any:
+    """The features of the published equations, one frame at a time: [4, 3136 + H]."""
+    obs, found = samples.flat(case.obs), []
+    action = np.asarray(case.action).reshape(4, -1)
+    for i, rows in enumerate(rows_of(obs)):
+        maps, kept = None, None
+        if case.encoder.maps:
+            maps = xp.asarray(np.asarray(obs.features)[i], words.dtype)
+        if case.keep is not None:
+            kept = np.reshape(case.keep, (4, 2, CELLS, CHANNELS))[i]
+        image = equations.image(
+            xp, params["trunk"], np.asarray(obs.cells)[i], words, int(obs.target[i]), action[i],
+            kept, maps=maps,
+        )  # fmt: skip
+        rows = xp.asarray(rows, words.dtype)
+        found.append(class_equations.mjolnir_r(xp, params, rows, words, KNOWN, image))
+    return xp.stack(found)
+
+
+@pytest.mark.parametrize(
+    ("maps", "training"),
+    [(False, False), (True, True)],
+    ids=["evaluating on rasters", "training on feature maps"],
+)
+def test_with_an_image_it_is_the_published_encoder_and_has_its_gradient(
+    maps: bool, training: bool
+) -> None:
+    case = image_case(maps, training)
+    mix = np.random.default_rng(4).normal(size=(4, 3136 + H)).astype(np.float32)
+
+    def fast(params: Any) -> tuple[jax.Array, jax.Array]:
+        variables = {"params": params}
+        table = case.encoder.apply(variables, WORDS, method="prepare")
+        out: Any = case.encoder.apply(variables, table, case.obs, case.action, case.keep)
+        out = out.reshape(4, -1)
+        return (out * mix).sum(), out
+
+    def slow(params: Any) -> jax.Array:
+        return (published(jnp, case, params, WORDS) * mix).sum()
+
+    grad, found = jax.jit(jax.grad(fast, has_aux=True))(case.params)
+    expected = published(np, case, equations.in_float64(case.params), np.asarray(WORDS, np.float64))
+    np.testing.assert_allclose(found, expected, **CLOSE)
+    for path, leaf in jax.tree.leaves_with_path(grad):
+        assert np.asarray(leaf).any(), jax.tree_util.keystr(path)
+    chex.assert_trees_all_close(grad, jax.grad(slow)(case.params), rtol=1e-3, atol=2e-3)
