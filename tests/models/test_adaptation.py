@@ -79,6 +79,22 @@ def learned_loss(params: Any, record: jax.Array) -> jax.Array:
     return jnp.sqrt((x[0] ** 2).sum())
 
 
+def adapted(params: Any, shared: Sequence[str]) -> dict[str, Any]:
+    """The parameters that are not under a shared name, by their path."""
+    return {
+        jax.tree_util.keystr(path): leaf
+        for path, leaf in jax.tree.leaves_with_path(params)
+        if not any(key.key in shared for key in path)
+    }
+
+
+def joined(params: Any, own: dict[str, Any]) -> Any:
+    """The parameters, with those by path in place of their own."""
+    return jax.tree.map_with_path(
+        lambda path, leaf: own.get(jax.tree_util.keystr(path), leaf), params
+    )
+
+
 def slow(
     params: Any,
     given: Any,
@@ -100,8 +116,8 @@ def slow(
         table = actor_critic.prepare(plain, theta, WORDS)
         return actor_critic.forward(plain, theta, table, carry, *shown)
 
-    def inner(theta: Any, carry: Any, stretch: list[Any]) -> jax.Array:
-        record = []
+    def inner(own: Any, theta: Any, carry: Any, stretch: list[Any]) -> jax.Array:
+        theta, record = joined(theta, own), []
         for shown in stretch:
             carry, out = step(theta, carry, shown)
             record.append(jnp.concatenate([carry[0][0], jax.nn.softmax(out.logits[0])]))
@@ -123,16 +139,11 @@ def slow(
             outs.append(out)
         if len(stretch) == STRETCH:
             at = jax.lax.stop_gradient((theta, before)) if first_order else (theta, before)
-            grad = jax.grad(inner)(*at, stretch)
+            grad = jax.grad(inner)(adapted(at[0], shared), *at, stretch)
             due = ~fresh[1:].any() & (count < LIMIT)
-            theta = jax.tree.map_with_path(
-                lambda path, p, g, d=due: (
-                    p
-                    if any(key.key in shared for key in path)
-                    else jnp.where(d, p - RATE * g, p)
-                ),
-                theta, grad,
-            )  # fmt: skip
+            own = adapted(theta, shared)
+            own = jax.tree.map(lambda p, g, d=due: jnp.where(d, p - RATE * g, p), own, grad)
+            theta = joined(theta, own)
             count = count + due
     return jax.tree.map(lambda *x: jnp.concatenate(x), *outs)
 

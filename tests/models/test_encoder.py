@@ -116,11 +116,11 @@ def test_no_array_of_a_model_is_empty(name: str) -> None:
 def test_every_named_model_is_made_and_answers(name: str) -> None:
     names = tuple(f"Class{i}" for i in range(samples.CLASSES))
     model = make_model(dataclasses.replace(SMALL, model=name), Classes(names, tuple(range(7))))
+    obs = samples.one_per_class(samples.observations(B))
 
     def answer(key: jax.Array) -> Any:
         weights = model.initialise(key, WORDS)
         table = actor_critic.prepare(model, weights, WORDS)
-        obs = samples.one_per_class(samples.observations(B))
         state = model.initial_carry(B, weights), obs, jnp.zeros((B, 6)), jnp.ones(B, bool)
         return actor_critic.forward(model, weights, table, *state)[1]
 

@@ -89,17 +89,17 @@ def test_inner_steps_are_those_of_plain_per_environment_parameters() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("first_order", [False, True], ids=["second order", "first order"])
 def test_gradients_are_those_of_plain_per_environment_parameters(first_order: bool) -> None:
-    model = dataclasses.replace(MODEL, first_order=first_order)
+    model, given = dataclasses.replace(MODEL, first_order=first_order), inputs()
     mix = np.random.default_rng(2).normal(size=(T, B, 6)).astype(np.float32)
 
     def mixed(out: Output) -> jax.Array:
         return (out.logits * mix).sum() + (out.value * mix[..., 0]).sum()
 
     def fast(params: Any) -> jax.Array:
-        return mixed(play(model, params, inputs()))
+        return mixed(play(model, params, given))
 
     def plain(params: Any) -> jax.Array:
-        return mixed(slow_rollout(params, inputs(), first_order, plain=PLAIN, shared=SHARED))
+        return mixed(slow_rollout(params, given, first_order, plain=PLAIN, shared=SHARED))
 
     assert_gradients_close(
         jax.jit(jax.grad(fast))(parameters()), jax.jit(jax.grad(plain))(parameters())

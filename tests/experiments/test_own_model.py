@@ -1,0 +1,46 @@
+"""The model of the documentation's example: trained, evaluated and loaded as its page says."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import tdanet_jax
+from tdanet_jax.agent import Detection
+from tests.experiments import command
+
+PAGE = Path(__file__).parent.parent.parent / "docs" / "models.md"
+
+
+def block(name: str) -> str:
+    """The code below the comment of this name on the page."""
+    found = re.search(rf"<!-- {re.escape(name)} -->\n```\w+\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert found is not None, name
+    return found.group(1)
+
+
+@pytest.mark.usefixtures("ithor")  # the rooms are there: no line about computing them
+def test_the_example_on_the_page_is_a_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_lab").mkdir()
+    (tmp_path / "my_lab" / "most_alike.py").write_text(block("most_alike.py"))
+    python, _, module, *given = shlex.split(block("most_alike command"))
+    assert (python, module) == ("python", "experiments.train_zero_shot")
+    small = ("--steps", "400", "--history", "0", *command.TINY)
+    done = command.run("train_zero_shot", *given, *small, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / given[given.index("--out") + 1]
+    results = json.loads((out / "results.json").read_text())
+    assert results["unseen"]["L>=1"]["n"] == 1000
+    monkeypatch.syspath_prepend(tmp_path)
+    agent = tdanet_jax.load(out)
+    seen = [Detection("sink", 0.5, 0.6, 0.9, 0.9), Detection("toaster", 0.1, 0.4, 0.3, 0.7)]
+    _, decision = agent.act(agent.start(), seen, target="toaster")
+    assert sum(decision.probabilities) == pytest.approx(1, abs=1e-5)
+    _, other = agent.act(agent.start(), seen[:1], target="toaster")
+    assert other.value != decision.value
