@@ -49,6 +49,8 @@ class Command:
     checkpoint; the latter knows the way."""
     split: str = "18/4"
     """Split of the policies that need no checkpoint."""
+    validation: bool = False
+    """Their episodes are those that `--validation` of the training command leaves for choices."""
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote, in place of those of the run, or of the
     bundled ones."""
@@ -70,6 +72,8 @@ def main(arguments: list[str] | None = None) -> None:
             fail(f"--policy {command.policy} takes no --checkpoint")
         if not trained and command.history:
             fail(f"--policy {command.policy} has no --history")
+        if trained and command.validation:
+            fail("--validation: a trained run has its own rooms and classes")
         if len(set(command.checkpoint)) < len(command.checkpoint):
             fail("--checkpoint: a run is given twice")
         TrainConfig(split=command.split, seed=command.seed).check()
@@ -102,7 +106,8 @@ def evaluate_untrained(command: Command, folder: Path) -> None:
     from tdanet_jax import episodes, evaluation, policies, report
     from tdanet_jax.task import load_task
 
-    task = load_task(TrainConfig(split=command.split, data=command.data))
+    config = TrainConfig(split=command.split, validation=command.validation, data=command.data)
+    task = load_task(config)
     lists = episodes.load(task.tables, task.split, task.extras)
     make = {"random": policies.random, "shortest_path": policies.shortest_path}[command.policy]
     played = evaluation.evaluate_lists(make(), None, task.eval_params, lists, command.seed)

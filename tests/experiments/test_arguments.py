@@ -59,6 +59,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--policy random --checkpoint full", "--policy random takes no --checkpoint"),
         ("--policy random --split 17/5", "--split 17/5: choose one of"),
         ("--policy random --history", "--policy random has no --history"),
+        ("--checkpoint full --validation", "--validation: a trained run has its own rooms"),
         ("--checkpoint a --checkpoint a", "--checkpoint: a run is given twice"),
         ("--checkpoint a --checkpoint b", "several checkpoints need --out"),
         ("--policy random --seed x", "invalid literal for int() with base 10: 'x'"),
