@@ -67,10 +67,10 @@ def scaling(rows: Sequence[dict[str, Any]], path: Path) -> None:
         for axis in column:
             axis.grid(alpha=0.3)
             axis.spines[["top", "right"]].set_visible(False)
-    axes[0, 0].set(ylabel="environment steps per second", ylim=(0, None))
+    axes[0, 0].set(ylabel="environment steps / s", ylim=(0, None))
     axes[0, 0].yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:,.0f}"))
     axes[1, 0].set_ylabel("memory (MB)")
-    axes[1, 0].legend(frameon=False)
+    axes[1, -1].legend(frameon=False, loc="upper center")
     with files.replacing(path) as fresh:
         figure.savefig(fresh, dpi=130)
 

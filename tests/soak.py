@@ -4,7 +4,8 @@
 
 Runs the training command with its default network and batch on all cores and looks at its process
 once a second. Prints one JSON object: the slopes are of straight lines through the second half of
-the samples, when everything has been compiled and every buffer been used.
+the samples, when everything has been compiled and every buffer been used. Memory goes up and down
+with every checkpoint, so its medians over the quarters of the time stand beside the slope.
 """
 
 from __future__ import annotations
@@ -70,6 +71,7 @@ def report(minutes: float, folder: Path, samples: np.ndarray) -> dict[str, Any]:
         for i, name in enumerate(FIELDS)
         if name != "seconds"
     }
+    quarters = np.array_split(samples, 4)
     rows = read_metrics(folder)
     updates = [row["updates"] for row in rows]
     chunk = updates[0]
@@ -80,6 +82,7 @@ def report(minutes: float, folder: Path, samples: np.ndarray) -> dict[str, Any]:
         "steps_per_second": round(rows[-1]["steps"] / rows[-1]["seconds"]),
         **{f"last_{name}": float(samples[-1, i]) for i, name in enumerate(FIELDS)},
         **per_hour,
+        "resident_mb_by_quarter": [round(float(np.median(q[:, 1]))) for q in quarters],
         "rows": len(rows),
         "rows_complete": updates == list(range(chunk, updates[-1] + 1, chunk)),
         "cores": len(os.sched_getaffinity(0)),
