@@ -62,7 +62,10 @@ def show(command: Command) -> None:
     chosen = one_episode.choose(choice, runs, tables) if choice.given else None
     player = one_episode.load_players(runs, rooms, choice.policy)[0]
     if not player.attends:
-        fail(f"--checkpoint {command.checkpoint}: this model has no attention")
+        fail(
+            f"--checkpoint {command.checkpoint}: this model has no attention over the detections; "
+            "the TDANet models have"
+        )
     if chosen is None:
         played = play_lists(player, tables, choice.seed)
         write_pairs(player, tables, played, out)

@@ -487,10 +487,10 @@ def decision_row(task: Task, count: int, repeats: int) -> Row:
     from tdanet_jax.models import actor_critic
 
     model = task.model
-    weights = model.initialise(jax.random.key(0), task.words)
-    table = actor_critic.prepare(model, weights, task.words)
+    weights = jax.jit(model.initialise)(jax.random.key(0), task.words)
+    table = jax.jit(actor_critic.prepare, static_argnums=0)(model, weights, task.words)
     keys = jax.random.split(jax.random.key(1), count)
-    obs, _ = jax.vmap(env.reset, (0, None))(keys, task.eval_params)
+    obs, _ = jax.jit(jax.vmap(env.reset, (0, None)))(keys, task.eval_params)
     carry, fresh = model.initial_carry(count, weights), jnp.zeros(count, bool)
     previous = jnp.zeros((count, 6))
 

@@ -79,7 +79,7 @@ def look(
     obs = jax.vmap(env.observe, (0, None))(state, params)
     count = pose.shape[0]
     blank, fresh = jnp.zeros((count, NUM_ACTIONS)), jnp.ones(count, bool)
-    carry = model.initial_carry(count)
+    carry = model.initial_carry(count, weights)
     return obs, forward(model, weights, from_table, carry, obs, blank, fresh)[2]
 
 

@@ -14,6 +14,8 @@ from tdanet_jax.trace import View
 #: Height of a line and advance of a letter, in units of the font's size; on the wide side, as the
 #: reader's font is not known.
 LINE, LETTER = 1.15, 0.7
+#: What is left free at the sides of a picture, in the same units.
+MARGIN = 0.3
 _ADVANCE = {
     **dict.fromkeys("ijlI .,:'", 0.35),
     **dict.fromkeys("frt-()", 0.45),
@@ -44,19 +46,20 @@ def place(
     Args:
       things: (name, rectangle), most important first.
       size: of the font, in units of the rectangles.
-      bounds: no name sticks out of these.
+      bounds: no name sticks out of these, or touches their sides.
       centred: names start from the middle of their rectangles instead of the corners.
       most: how many names at most.
     """
     placed: list[Label] = []
     taken: list[Rectangle] = []
+    margin = MARGIN * size
     for number, (text, thing) in enumerate(things):
         if len(placed) == most:
             break
         width, height = extent(text, size)
         spots = _centred if centred else _cornered
         for left, y in spots(thing, width, height):
-            x = max(min(left, bounds[2] - width), bounds[0])
+            x = max(min(left, bounds[2] - margin - width), bounds[0] + margin)
             spot = (x, y, x + width, y + height)
             if _inside(spot, bounds) and not any(_overlap(spot, other) for other in taken):
                 placed.append(Label(text, x, y, number))

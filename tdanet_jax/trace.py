@@ -275,5 +275,5 @@ def _thoughts(
         )
         return (carry, probabilities, jnp.zeros(1, bool)), jax.tree.map(lambda x: x[0], thoughts)
 
-    memory = model.initial_carry(1), jnp.zeros((1, NUM_ACTIONS)), jnp.ones(1, bool)
+    memory = model.initial_carry(1, weights), jnp.zeros((1, NUM_ACTIONS)), jnp.ones(1, bool)
     return jax.lax.scan(step, memory, pose)[1]

@@ -7,9 +7,11 @@ import json
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -19,7 +21,7 @@ from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.config import CONFIG_FILE, NetworkConfig, TrainConfig
 from tdanet_jax.learner import TrainState
 from tdanet_jax.scenes import SceneTables, load_tables
-from tdanet_jax.task import make_task
+from tdanet_jax.task import Task, make_task
 from tdanet_jax.vocabulary import Action
 from tdanet_jax.words import WordVectors
 
@@ -76,19 +78,31 @@ def opinionated_run(
 ) -> Path:
     """The folder of a run that nobody trained: a tiny network with opinions, and eight records."""
     folder = tmp_path_factory.mktemp("runs") / "my-run"
-    folder.mkdir()
-    (folder / CONFIG_FILE).write_text(json.dumps(configs.to_json(TINY)))
-    task = make_task(TINY, some_rooms, glove)
-    task.classes.save(folder)
-    weights = jax.jit(task.model.initialise)(jax.random.key(0), task.words)
-    weights["actor"]["kernel"] *= 60
-    weights["actor"]["bias"] = weights["actor"]["bias"].at[Action.DONE].set(-1.0)
-    rest = {field.name: jnp.int32(0) for field in dataclasses.fields(TrainState)}
-    state = TrainState(**rest | {"params": weights, "key": jax.random.key(0)})
-    Checkpoints(folder).save(state, {"seconds": 0.0, "data_version": some_rooms.data_version})
+    task, weights = save_untrained(TINY, folder, some_rooms, glove)
     chosen = episodes.draw(some_rooms, task.split.eval_scenes, task.split.seen, 2, seed=0)
     policy = policies.network(task.model, task.words)
     records = evaluation.evaluate(policy, weights, task.eval_params, chosen, jax.random.key(0))
     rows = report.episode_rows("seen", report.columns(some_rooms, chosen, records), records)
     (folder / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return folder
+
+
+def save_untrained(
+    config: TrainConfig, folder: Path, tables: SceneTables, vectors: WordVectors
+) -> tuple[Task, Any]:
+    """Makes a run's folder with one checkpoint: drawn parameters, an actor with opinions."""
+    folder.mkdir()
+    (folder / CONFIG_FILE).write_text(json.dumps(configs.to_json(config)))
+    task = make_task(config, tables, vectors)
+    task.classes.save(folder)
+    shapes = jax.eval_shape(task.model.initialise, jax.random.key(0), task.words)
+    rng = np.random.default_rng(0)  # the initialisers' own draw takes seconds to compile
+    weights = jax.tree.map(
+        lambda x: jnp.asarray(rng.normal(size=x.shape) / max(x.shape[0], 1) ** 0.5, x.dtype)
+        if len(x.shape) > 1 else jnp.zeros(x.shape, x.dtype), shapes,
+    )  # fmt: skip
+    weights["actor"]["bias"] = weights["actor"]["bias"].at[Action.DONE].set(-1.0)
+    rest = {field.name: jnp.int32(0) for field in dataclasses.fields(TrainState)}
+    state = TrainState(**rest | {"params": weights, "key": jax.random.key(0)})
+    Checkpoints(folder).save(state, {"seconds": 0.0, "data_version": tables.data_version})
+    return task, weights

@@ -51,7 +51,7 @@ def decide_alike(agent, some_rooms, glove, merge):
     model, weights = agent.model, agent.weights
     table = actor_critic.prepare(model, weights, jnp.asarray(glove.table(some_rooms.classes)))
     goal = some_rooms.targets.index("Mug")
-    memory, carry, previous = agent.start(), model.initial_carry(1), jnp.zeros((1, 6))
+    memory, carry, previous = agent.start(), model.initial_carry(1, weights), jnp.zeros((1, 6))
     for pose in (1001, 1003, 1019):
         one = jnp.array([pose]), jnp.array([goal])
         state = jax.vmap(env.start, (None, 0, 0))(params, *one)

@@ -196,7 +196,7 @@ def test_a_network_acts_as_a_plain_loop_over_its_own_past_does(
 
     for i in range(0, len(chosen), 5):
         state = env.start(params, jnp.int32(chosen.pose[i]), jnp.int32(chosen.target[i]))
-        carry, previous = MODEL.initial_carry(1), jnp.zeros((1, 6))
+        carry, previous = MODEL.initial_carry(1, weights), jnp.zeros((1, 6))
         for t in range(min(int(records.length[i]), 12)):
             carry, out = think(state, carry, previous, jnp.array([t == 0]))
             previous = jax.nn.softmax(out.logits)
@@ -229,7 +229,7 @@ def test_sampled_actions_follow_the_probabilities_of_the_network(
     table = actor_critic.prepare(MODEL, weights, words)
     state = env.start(params, jnp.asarray(start.pose[:1]), jnp.asarray(start.target[:1]))
     obs = jax.vmap(env.observe, (0, None))(state, params)
-    blank = (MODEL.initial_carry(1), obs, jnp.zeros((1, 6)), jnp.ones(1, bool))
+    blank = (MODEL.initial_carry(1, weights), obs, jnp.zeros((1, 6)), jnp.ones(1, bool))
     _, out = actor_critic.forward(MODEL, weights, table, *blank)
     share = np.bincount(records.actions[:, 0], minlength=6) / 4000
     # A share of 4,000 draws has a standard deviation of at most 0.008.

@@ -89,7 +89,7 @@ class ActorCritic(nn.Module):
         """The encoder's weights over the detections, [..., K]; None if it has none."""
         return self.encoder.attend(table, obs)
 
-    def initial_carry(self, batch: int, weights: Any = None, training: bool = False) -> Any:
+    def initial_carry(self, batch: int, weights: Any, training: bool = False) -> Any:
         """The recurrent state at the start of an episode: zeros.
 
         Args:

@@ -173,7 +173,7 @@ class AdaptiveActorCritic(ActorCritic):
         """Stretches of k steps begin anew with a rollout."""
         return carry.replace(phase=jnp.zeros_like(carry.phase))
 
-    def initial_carry(self, batch: int, weights: Any = None, training: bool = False) -> Memory:
+    def initial_carry(self, batch: int, weights: Any, training: bool = False) -> Memory:
         """The recurrent state at the start of an episode: nothing adapted yet."""
         k, pairs = self.stretch, self.limit * self.stretch
         gates = 4 * self.hidden

@@ -1,6 +1,7 @@
 """The commands that show what an agent does: replay, trajectories, attention."""
 
 import csv
+import dataclasses
 import json
 import os
 import re
@@ -15,6 +16,7 @@ from tdanet_jax import episodes
 from tdanet_jax.scenes import dataset
 from tdanet_jax.scenes.dataset import Rooms
 from tests import browser
+from tests.conftest import TINY, save_untrained
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +118,27 @@ def test_attention_is_averaged_over_the_test_episodes_and_one_is_drawn(
     attention.main(["--checkpoint", run, "--data", rooms_file, "--episode", "2", "--out", str(out)])
     record = json.loads((opinionated_run / "episodes.jsonl").read_text().splitlines()[2])
     assert (out / f"{record['scene']}-{record['target']}.png").stat().st_size > 10_000
+
+
+def test_a_model_that_sees_an_image_and_adapts_stands_beside_another(
+    tmp_path, capsys, rooms_file, opinionated_run, some_rooms, glove
+):
+    run, out = tmp_path / "savn", tmp_path / "both.html"
+    network = dataclasses.replace(TINY.network, image="raster", inner_rate=50.0)
+    save_untrained(dataclasses.replace(TINY, model="savn", network=network), run, some_rooms, glove)
+    chosen = ["--scene", "FloorPlan229", "--target", "Painting", "--start", "0", "0", "90"]
+    both = ["--checkpoint", str(run), "--checkpoint", str(opinionated_run), "--policy", "greedy"]
+    replay.main([*both, *chosen, "--data", rooms_file, "--out", str(out)])
+    text = re.search(r'type="application/json">(.*?)</script>', out.read_text(), re.S).group(1)
+    adaptive, attending = json.loads(text)["players"]
+    assert (adaptive["attends"], attending["attends"]) == (False, True)
+    decided = adaptive["steps"][:-1]
+    assert len(decided) > 6  # so that it has adapted
+    for step in decided:  # as the network that played decided
+        assert step["action"] == np.argmax(step["probabilities"])
+    with pytest.raises(SystemExit):
+        attention.main(["--checkpoint", str(run), *chosen, "--data", rooms_file])
+    assert f"{run}: this model has no attention" in capsys.readouterr().err
 
 
 def test_the_page_of_a_real_room_as_a_user_asks_for_it(opinionated_run, tmp_path):

@@ -125,7 +125,7 @@ def test_a_fresh_episode_knows_nothing_of_the_carry() -> None:
     carry, obs, previous, _, keep = inputs()
     row = jax.tree.map(lambda x: x[0], (obs, previous))
     fresh = jnp.ones(B, bool)
-    zero = network().initial_carry(B)
+    zero = network().initial_carry(B, parameters())
     chex.assert_trees_all_equal(
         forward(parameters(), carry, *row, fresh, keep[0]),
         forward(parameters(), zero, *row, fresh, keep[0]),

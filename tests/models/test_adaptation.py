@@ -110,7 +110,7 @@ def slow(
       shared: names of parameters and layers that are not adapted.
     """
     network = {name: value for name, value in params.items() if name != "learned_loss"}
-    theta, carry, count, outs = network, plain.initial_carry(1), 0, []
+    theta, carry, count, outs = network, plain.initial_carry(1, network), 0, []
 
     def step(theta: Any, carry: Any, shown: Any) -> tuple[Any, Output]:
         table = actor_critic.prepare(plain, theta, WORDS)
@@ -218,7 +218,9 @@ def test_the_plain_network_is_the_one_that_adapts() -> None:
     _, out = play(still, params, start(params), inputs())
     network = {name: value for name, value in params.items() if name != "learned_loss"}
     table = actor_critic.prepare(PLAIN, network, WORDS)
-    _, plain = actor_critic.forward(PLAIN, network, table, PLAIN.initial_carry(B), *inputs())
+    _, plain = actor_critic.forward(
+        PLAIN, network, table, PLAIN.initial_carry(B, network), *inputs()
+    )
     chex.assert_trees_all_close(out, plain, **CLOSE)
 
 

@@ -132,7 +132,7 @@ def test_the_published_size() -> None:
 @pytest.mark.parametrize("part", ["cells", "target"])
 def test_the_image_and_the_target_matter(part: str) -> None:
     carry, obs, previous, fresh, _ = jax.tree.map(lambda x: x[0], inputs())
-    carry = MODEL.initial_carry(B)
+    carry = MODEL.initial_carry(B, parameters())
 
     def logits(obs: Observation) -> jax.Array:
         table = actor_critic.prepare(MODEL, parameters(), WORDS)
