@@ -47,8 +47,9 @@ class Command:
     policy: Literal["sample", "greedy", "random", "shortest_path"] = "sample"
     """sample and greedy: how the network's actions are chosen. random and shortest_path need no
     checkpoint; the latter knows the way."""
-    split: str = "18/4"
-    """Split of the policies that need no checkpoint."""
+    split: str | None = None
+    """Split of the policies that need no checkpoint; by default 18/4. A run is evaluated on its
+    own."""
     validation: bool = False
     """Their episodes are those that `--validation` of the training command leaves for choices."""
     data: str | None = None
@@ -72,11 +73,13 @@ def main(arguments: list[str] | None = None) -> None:
             fail(f"--policy {command.policy} takes no --checkpoint")
         if not trained and command.history:
             fail(f"--policy {command.policy} has no --history")
+        if trained and command.split is not None:
+            fail(f"--split {command.split}: a run is evaluated on its own split")
         if trained and command.validation:
             fail("--validation: a trained run has its own rooms and classes")
         if len(set(command.checkpoint)) < len(command.checkpoint):
             fail("--checkpoint: a run is given twice")
-        TrainConfig(split=command.split, seed=command.seed).check()
+        untrained_config(command).check()
         folder = command.out or default_folder(command)
         check_empty(folder)
         if not trained:
@@ -101,13 +104,20 @@ def default_folder(command: Command) -> Path:
     return (command.checkpoint[0] if command.checkpoint else Path("runs")) / kind
 
 
+def untrained_config(command: Command) -> TrainConfig:
+    """The task and seed of the policies that need no checkpoint."""
+    split = command.split or TrainConfig().split
+    return TrainConfig(
+        split=split, validation=command.validation, data=command.data, seed=command.seed
+    )
+
+
 def evaluate_untrained(command: Command, folder: Path) -> None:
     """Random or the shortest path."""
     from tdanet_jax import episodes, evaluation, policies, report
     from tdanet_jax.task import load_task
 
-    config = TrainConfig(split=command.split, validation=command.validation, data=command.data)
-    task = load_task(config)
+    task = load_task(untrained_config(command))
     lists = episodes.load(task.tables, task.split, task.extras)
     make = {"random": policies.random, "shortest_path": policies.shortest_path}[command.policy]
     played = evaluation.evaluate_lists(make(), None, task.eval_params, lists, command.seed)

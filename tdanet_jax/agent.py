@@ -87,10 +87,6 @@ class Agent:
         self.config = config
         self.classes = Classes() if classes is None else classes
         self.model: ActorCritic = make_model(config, self.classes)
-        if self.model.encoder.IMAGE:
-            raise ValueError(
-                f"{config.model} looks at an image; an agent is shown detections alone"
-            )
         self.weights = weights
         self._vectors = vectors
         self._labels = {class_words(name): i for i, name in enumerate(self.classes.names)}
@@ -118,7 +114,12 @@ class Agent:
 
         Raises:
           KeyError: a label has a word without a word vector.
+          ValueError: the model looks at an image, and not at detections.
         """
+        if self.model.encoder.IMAGE:
+            raise ValueError(
+                f"{self.config.model} looks at an image; an agent is shown detections alone"
+            )
         obs, owner = self._observe(detections, target)
         carry, logits, value, attention = self._decide(self.weights, self._prepared(), memory, obs)
         best = jnp.argmax(logits, -1) if key is None else jax.random.categorical(key, logits)

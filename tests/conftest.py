@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -19,11 +18,14 @@ from tdanet_jax import config as configs
 from tdanet_jax import episodes, evaluation, policies, report, words
 from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.config import CONFIG_FILE, NetworkConfig, TrainConfig
+from tdanet_jax.episodes import Episodes
 from tdanet_jax.learner import TrainState
-from tdanet_jax.scenes import SceneTables, load_tables
+from tdanet_jax.scenes import SceneTables, dataset, load_tables
+from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.task import Task, make_task
 from tdanet_jax.vocabulary import Action
 from tdanet_jax.words import WordVectors
+from tests.models import samples
 
 # No deadline: tests do not time anything. Derandomised: the same examples on every run.
 settings.register_profile("tests", deadline=None, derandomize=True, database=None)
@@ -63,6 +65,26 @@ def some_rooms(ithor: SceneTables) -> SceneTables:
 
 
 @pytest.fixture(scope="session")
+def rooms_file(some_rooms: SceneTables, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same eight rooms in a file, for `--data`."""
+    path = tmp_path_factory.mktemp("rooms") / "rooms.npz"
+    dataset.save(Rooms(some_rooms, None), path)
+    return path
+
+
+@pytest.fixture
+def few_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tenth of the test episodes, as evenly over the room types, for tests of other things."""
+    load = episodes.load
+
+    def few(*arguments: Any) -> dict[str, Episodes]:
+        lists = load(*arguments).items()
+        return {name: Episodes(found.pose[::10], found.target[::10]) for name, found in lists}
+
+    monkeypatch.setattr(episodes, "load", few)
+
+
+@pytest.fixture(scope="session")
 def glove() -> WordVectors:
     """The bundled word vectors."""
     return words.load_bundled()
@@ -95,12 +117,7 @@ def save_untrained(
     (folder / CONFIG_FILE).write_text(json.dumps(configs.to_json(config)))
     task = make_task(config, tables, vectors)
     task.classes.save(folder)
-    shapes = jax.eval_shape(task.model.initialise, jax.random.key(0), task.words)
-    rng = np.random.default_rng(0)  # the initialisers' own draw takes seconds to compile
-    weights = jax.tree.map(
-        lambda x: jnp.asarray(rng.normal(size=x.shape) / max(x.shape[0], 1) ** 0.5, x.dtype)
-        if len(x.shape) > 1 else jnp.zeros(x.shape, x.dtype), shapes,
-    )  # fmt: skip
+    weights = samples.parameters(task.model, task.words)
     weights["actor"]["bias"] = weights["actor"]["bias"].at[Action.DONE].set(-1.0)
     rest = {field.name: jnp.int32(0) for field in dataclasses.fields(TrainState)}
     state = TrainState(**rest | {"params": weights, "key": jax.random.key(0)})

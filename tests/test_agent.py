@@ -29,7 +29,7 @@ CONFIG = TrainConfig(network=NetworkConfig(width=16, hidden=16, precision="float
 @pytest.fixture(scope="module")
 def weights(glove):
     model = make_model(CONFIG, Classes())
-    return model.initialise(jax.random.key(3), jnp.asarray(glove.table(["Mug", "Bed"])))
+    return samples.parameters(model, glove.table(["Mug", "Bed"]))
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def row_agent(some_rooms, glove):
     config = dataclasses.replace(CONFIG, model="ssnet")
     model = make_model(config, classes)
     words = jnp.asarray(glove.table(some_rooms.classes))
-    weights = samples.randomised(model.initialise(jax.random.key(3), words))
+    weights = samples.parameters(model, words)
     return Agent(config, weights, glove, classes)
 
 
@@ -98,6 +98,17 @@ def test_a_model_with_a_row_per_class_sees_known_classes_alone_and_any_target(ro
     assert np.abs(probabilities([sink], "toaster") - plain).max() > 1e-4
     assert np.abs(probabilities([sink, mug], "dog") - plain).max() > 1e-4
     assert row_agent.act(row_agent.start(), [sink], "mug")[1].attention is None
+
+
+def test_a_model_that_sees_an_image_can_be_looked_into_but_not_asked(some_rooms, glove):
+    classes = make_classes(some_rooms.classes, {"Toaster"})
+    network = dataclasses.replace(CONFIG.network, image="raster")
+    config = dataclasses.replace(CONFIG, model="baseline", network=network)
+    words = glove.table(some_rooms.classes)
+    agent = Agent(config, samples.parameters(make_model(config, classes), words), glove, classes)
+    assert agent.weights["actor"]["kernel"].shape == (16, 6)
+    with pytest.raises(ValueError, match="baseline looks at an image; an agent is shown det"):
+        agent.act(agent.start(), [Detection("sink", 0.1, 0.1, 0.3, 0.4)], "mug")
 
 
 def test_attention_sums_to_one_over_the_detections_and_none_is_fine(agent):

@@ -19,7 +19,7 @@ from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.trace import Player
 from tdanet_jax.vocabulary import TARGETS, Action
 from tests import oracle
-from tests.models import equations
+from tests.models import equations, samples
 from tests.oracle import Episode, World, pose_of
 
 
@@ -156,7 +156,7 @@ class Blind(Encoder):
 
 def test_a_network_without_attention_has_the_rest(some_rooms, player, chosen):
     model = ActorCritic(Blind(), hidden=16)
-    weights = model.initialise(jax.random.key(0), player.task.words)
+    weights = samples.parameters(model, player.task.words)
     blind = dataclasses.replace(player, model=model, weights=weights)
     assert not blind.attends
     seen = trace.play(blind, some_rooms, one(chosen, 0))

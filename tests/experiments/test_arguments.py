@@ -58,6 +58,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("", "--policy sample needs --checkpoint"),
         ("--policy random --checkpoint full", "--policy random takes no --checkpoint"),
         ("--policy random --split 17/5", "--split 17/5: choose one of"),
+        ("--checkpoint full --split 18/4", "--split 18/4: a run is evaluated on its own split"),
         ("--policy random --history", "--policy random has no --history"),
         ("--checkpoint full --validation", "--validation: a trained run has its own rooms"),
         ("--checkpoint a --checkpoint a", "--checkpoint: a run is given twice"),

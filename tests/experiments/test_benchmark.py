@@ -45,7 +45,7 @@ def test_the_hand_formula_counts_the_kernels_that_a_step_uses():
     """All kernels but W_L's, which is used once per update for the table of classes."""
     network = NetworkConfig(width=32, hidden=48, precision="float32")
     model = make_model(TrainConfig(network=network), Classes())
-    weights = model.initialise(jax.random.key(0), jnp.ones((5, 50)))
+    weights = jax.eval_shape(model.initialise, jax.random.key(0), jnp.ones((5, 50)))
     del weights["encoder"]["attention"]
     kernels = sum(leaf.size for leaf in jax.tree.leaves(weights) if leaf.ndim == 2)
     assert benchmark.tdanet_forward_macs(model, 50) == kernels

@@ -15,6 +15,7 @@ from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.history import Snapshot
 from tdanet_jax.task import make_task
 from tests.experiments import command
+from tests.models import samples
 from tests.test_agent import OLD_RUN
 
 
@@ -43,7 +44,7 @@ def runs(ithor, glove, tmp_path_factory):
     """Two runs of two seeds, each with two points of history that differ."""
     out = tmp_path_factory.mktemp("runs")
     task = make_task(TINY, ithor, glove)
-    weights = jax.jit(task.model.initialise)(jax.random.key(0), task.words)
+    weights = samples.parameters(task.model, task.words)
     for seed in (0, 1):
         folder = out / f"seed{seed}"
         folder.mkdir()
@@ -55,7 +56,7 @@ def runs(ithor, glove, tmp_path_factory):
     return out
 
 
-def test_the_history_of_two_runs_gives_a_curve_and_all_records(runs, tmp_path):
+def test_the_history_of_two_runs_gives_a_curve_and_all_records(runs, few_episodes, tmp_path):
     out = tmp_path / "curve"
     chosen = [f"--checkpoint={runs / name}" for name in ("seed0", "seed1")]
     evaluate.main([*chosen, "--history", "--out", str(out)])
@@ -66,13 +67,13 @@ def test_the_history_of_two_runs_gives_a_curve_and_all_records(runs, tmp_path):
     assert places == [("seed0", 1, 100), ("seed0", 2, 200), ("seed1", 1, 100), ("seed1", 2, 200)]
     assert [r["steps"] for r in found] == [400, 800, 400, 800]  # 2 environments, 20 steps
     records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
-    assert len(records) == 4 * 2000
+    assert len(records) == 4 * 200
     for result in found:
         own = [
             r["success"] for r in records
             if (r["run"], r["updates"], r["group"]) == (result["run"], result["updates"], "unseen")
         ]  # fmt: skip
-        assert result["unseen"]["L>=1"]["SR"] == pytest.approx(100 * sum(own) / 1000)
+        assert result["unseen"]["L>=1"]["SR"] == pytest.approx(100 * sum(own) / 100)
 
 
 def test_one_run_gives_the_files_of_a_single_result_beside_it(ithor, tmp_path):
@@ -83,6 +84,27 @@ def test_one_run_gives_the_files_of_a_single_result_beside_it(ithor, tmp_path):
     }  # fmt: skip
     out = json.loads((run / "greedy" / "results.json").read_text())
     assert [out[k] for k in ("policy", "seed", "steps", "episodes_trained")] == ["greedy", 0, 16, 1]
+
+
+def test_a_run_is_evaluated_in_rooms_of_a_file(
+    opinionated_run, rooms_file, few_episodes, some_rooms, tmp_path, capsys
+):
+    run, out = str(opinionated_run), tmp_path / "there"
+    evaluate.main(["--checkpoint", run, "--data", str(rooms_file), "--out", str(out)])
+    results = json.loads((out / "results.json").read_text())
+    assert results["data_version"] == some_rooms.data_version
+    records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    assert len(records) == results["seen"]["L>=1"]["n"] + results["unseen"]["L>=1"]["n"] == 200
+    # Of the file's rooms, those that are test rooms.
+    there = {"FloorPlan29", "FloorPlan229", "FloorPlan321", "FloorPlan428"}
+    assert {record["scene"] for record in records} == there
+    page = (out / "results.md").read_text()
+    assert f"These rooms are those of {rooms_file}." in page
+
+    with pytest.raises(SystemExit):  # without the file, these are other rooms than in training
+        evaluate.main(["--checkpoint", run, "--out", str(tmp_path / "here")])
+    assert f"{run}: trained on scene tables {some_rooms.data_version}" in capsys.readouterr().err
+    assert not (tmp_path / "here").exists()
 
 
 def test_a_run_without_history_is_named(runs, capsys, tmp_path):

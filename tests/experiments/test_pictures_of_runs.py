@@ -13,18 +13,8 @@ import pytest
 
 from experiments import attention, replay, trajectories
 from tdanet_jax import episodes
-from tdanet_jax.scenes import dataset
-from tdanet_jax.scenes.dataset import Rooms
 from tests import browser
 from tests.conftest import TINY, save_untrained
-
-
-@pytest.fixture(scope="module")
-def rooms_file(some_rooms, tmp_path_factory):
-    """Eight rooms in a file, for `--data`."""
-    path = tmp_path_factory.mktemp("rooms") / "rooms.npz"
-    dataset.save(Rooms(some_rooms, None), path)
-    return str(path)
 
 
 @pytest.mark.parametrize("command", [replay, trajectories, attention])
@@ -52,7 +42,7 @@ def test_wrong_arguments_give_one_line_and_write_nothing(
     words = [str(opinionated_run) if word == "RUN" else word for word in arguments.split()]
     before = sorted(opinionated_run.rglob("*"))
     with pytest.raises(SystemExit) as stop:
-        command.main([*words, "--data", rooms_file])
+        command.main([*words, "--data", str(rooms_file)])
     said = capsys.readouterr()
     assert stop.value.code == 2
     assert message in said.err
@@ -65,7 +55,7 @@ def test_a_picture_of_an_unknown_kind_is_refused(tmp_path, capsys, rooms_file, o
     out = tmp_path / "way.jpeg2"
     with pytest.raises(SystemExit):
         trajectories.main(
-            ["--checkpoint", str(opinionated_run), "--episode", "1", "--data", rooms_file,
+            ["--checkpoint", str(opinionated_run), "--episode", "1", "--data", str(rooms_file),
              "--out", str(out)]
         )  # fmt: skip
     assert "jpeg2" in capsys.readouterr().err
@@ -76,7 +66,7 @@ def test_ways_of_two_runs_and_the_shortest_are_drawn(tmp_path, capsys, rooms_fil
     run, out = str(opinionated_run), tmp_path / "new" / "way.svg"
     trajectories.main(
         ["--checkpoint", run, "--checkpoint", run, "--shortest", "--episode", "3",
-         "--data", rooms_file, "--out", str(out)]
+         "--data", str(rooms_file), "--out", str(out)]
     )  # fmt: skip
     record = json.loads((opinionated_run / "episodes.jsonl").read_text().splitlines()[3])
     said = capsys.readouterr().out
@@ -99,7 +89,7 @@ def test_attention_is_averaged_over_the_test_episodes_and_one_is_drawn(
 
     monkeypatch.setattr(episodes, "load", few)
     run, out = str(opinionated_run), tmp_path / "out"
-    attention.main(["--checkpoint", run, "--data", rooms_file, "--out", str(out)])
+    attention.main(["--checkpoint", run, "--data", str(rooms_file), "--out", str(out)])
     said = capsys.readouterr().out
     assert "playing 32 test episodes" in said
     names = {path.name for path in out.iterdir()}
@@ -115,7 +105,9 @@ def test_attention_is_averaged_over_the_test_episodes_and_one_is_drawn(
     assert (shares >= 0).all()
     assert (shares <= 1 + 1e-4).all()
 
-    attention.main(["--checkpoint", run, "--data", rooms_file, "--episode", "2", "--out", str(out)])
+    attention.main(
+        ["--checkpoint", run, "--data", str(rooms_file), "--episode", "2", "--out", str(out)]
+    )
     record = json.loads((opinionated_run / "episodes.jsonl").read_text().splitlines()[2])
     assert (out / f"{record['scene']}-{record['target']}.png").stat().st_size > 10_000
 
@@ -128,7 +120,7 @@ def test_a_model_that_sees_an_image_and_adapts_stands_beside_another(
     save_untrained(dataclasses.replace(TINY, model="savn", network=network), run, some_rooms, glove)
     chosen = ["--scene", "FloorPlan229", "--target", "Painting", "--start", "0", "0", "90"]
     both = ["--checkpoint", str(run), "--checkpoint", str(opinionated_run), "--policy", "greedy"]
-    replay.main([*both, *chosen, "--data", rooms_file, "--out", str(out)])
+    replay.main([*both, *chosen, "--data", str(rooms_file), "--out", str(out)])
     text = re.search(r'type="application/json">(.*?)</script>', out.read_text(), re.S).group(1)
     adaptive, attending = json.loads(text)["players"]
     assert (adaptive["attends"], attending["attends"]) == (False, True)
@@ -137,7 +129,7 @@ def test_a_model_that_sees_an_image_and_adapts_stands_beside_another(
     for step in decided:  # as the network that played decided
         assert step["action"] == np.argmax(step["probabilities"])
     with pytest.raises(SystemExit):
-        attention.main(["--checkpoint", str(run), *chosen, "--data", rooms_file])
+        attention.main(["--checkpoint", str(run), *chosen, "--data", str(rooms_file)])
     assert f"{run}: this model has no attention" in capsys.readouterr().err
 
 

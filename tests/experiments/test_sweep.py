@@ -51,7 +51,7 @@ def test_wrong_arguments_give_one_line_and_write_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_sweep_trains_evaluates_the_history_and_reports(ithor, tmp_path, capsys):
+def test_a_sweep_trains_evaluates_the_history_and_reports(ithor, few_episodes, tmp_path, capsys):
     out = tmp_path / "sweep"
     arguments = ["--seeds", "0", *TINY, "--out", str(out)]
     sweep.main(arguments)
@@ -62,7 +62,7 @@ def test_a_sweep_trains_evaluates_the_history_and_reports(ithor, tmp_path, capsy
     report = json.loads((out / "report.json").read_text())
     models = report["comparison"]["18/4"]
     assert models["shortest_path"]["unseen"]["L>=1"]["SPL"] == {"mean": 100.0, "sd": None}
-    assert 8 < models["random"]["seen"]["L>=1"]["SR"]["mean"] < 15
+    assert 5 < models["random"]["seen"]["L>=1"]["SR"]["mean"] < 20
     assert len(report["learning_curves"]["18/4"]["tdanet"]["episodes"]) == 2
     assert set(report["costs"]["tdanet"]["milliseconds"]) == {"1", "1024"}
     assert "Split 14/8: nothing was trained." in (out / "report.md").read_text()

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tdanet_jax.env import FEATURES, RASTER, Observation
+from tdanet_jax.models.actor_critic import ActorCritic
 
 CLASSES, WIDTH, DETECTIONS = 9, 5, 6  # C, D, K
 
@@ -49,12 +50,19 @@ def one_per_class(obs: Observation, seed: int = 3) -> Observation:
     )
 
 
+def parameters(model: ActorCritic, words: Any, seed: int = 2) -> Any:
+    """Random parameters of a network; its own initialisers take seconds to compile."""
+    return randomised(jax.eval_shape(model.initialise, jax.random.key(0), words), seed)
+
+
 def randomised(params: Any, seed: int = 2) -> Any:
-    """Parameters of the same shapes with nothing at zero, biases included."""
+    """Parameters of the same shapes (arrays, or shapes alone) with nothing at zero, biases too."""
     leaves, tree = jax.tree.flatten(params)
     rng = np.random.default_rng(seed)
+    inputs = [max((*x.shape, 1)[0], 1) for x in leaves]
     new = [
-        rng.normal(size=x.shape).astype(np.float32) / np.sqrt(max(x.shape[0], 1)) for x in leaves
+        rng.normal(size=x.shape).astype(np.float32) / np.sqrt(n)
+        for x, n in zip(leaves, inputs, strict=True)
     ]
     return jax.tree.unflatten(tree, [jnp.asarray(x) for x in new])
 

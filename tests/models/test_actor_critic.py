@@ -29,7 +29,7 @@ def network(**encoder: Any) -> ActorCritic:
 
 @functools.cache
 def parameters() -> Any:
-    return samples.randomised(jax.jit(network().initialise)(jax.random.key(0), WORDS))
+    return samples.parameters(network(), WORDS)
 
 
 def inputs(seed: int = 0) -> tuple[Carry, Observation, jax.Array, jax.Array, jax.Array]:

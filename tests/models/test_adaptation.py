@@ -39,7 +39,7 @@ CLOSE = {"rtol": 1e-3, "atol": 1e-4}  # float32 sums of thousands of products, t
 
 @functools.cache
 def parameters() -> Any:
-    params = samples.randomised(jax.jit(MODEL.initialise)(jax.random.key(0), WORDS))
+    params = samples.parameters(MODEL, WORDS)
     # Gates that are not saturated: 3,136 features go into each.
     lstm = {name: 0.3 * value for name, value in params["lstm"].items()}
     return {**params, "lstm": lstm}

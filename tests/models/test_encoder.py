@@ -55,9 +55,9 @@ class Inside(Counts):
 
 def logits(encoder: Encoder, previous: jax.Array) -> tuple[Any, jax.Array]:
     model = ActorCritic(encoder, hidden=6)
-    weights = samples.randomised(model.initialise(jax.random.key(0), WORDS))
+    weights = samples.parameters(model, WORDS)
     table = actor_critic.prepare(model, weights, WORDS)
-    state = model.initial_carry(B), samples.observations(B), previous, jnp.ones(B, bool)
+    state = model.initial_carry(B, weights), samples.observations(B), previous, jnp.ones(B, bool)
     return weights, actor_critic.forward(model, weights, table, *state)[1].logits
 
 

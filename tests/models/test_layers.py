@@ -71,8 +71,8 @@ def example(seed: int, fresh_share: float = 0.3) -> tuple[Any, ...]:
     rng = np.random.default_rng(seed)
     carry = (normal(B, H, seed=seed + 1), normal(B, H, seed=seed + 2))
     x, fresh = normal(T, B, N, seed=seed + 3), jnp.asarray(rng.random((T, B)) < fresh_share)
-    params = Stack().init(jax.random.key(0), carry, x[0], fresh[0])["params"]
-    return randomised(params, seed), carry, x, fresh
+    made = jax.eval_shape(Stack().init, jax.random.key(0), carry, x[0], fresh[0])
+    return randomised(made["params"], seed), carry, x, fresh
 
 
 def recorded(

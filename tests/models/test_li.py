@@ -42,7 +42,7 @@ CLOSE = {"rtol": 1e-3, "atol": 1e-4}  # float32 sums in another order, through i
 
 @functools.cache
 def parameters() -> Any:
-    return samples.randomised(jax.jit(MODEL.initialise)(jax.random.key(0), WORDS))
+    return samples.parameters(MODEL, WORDS)
 
 
 def inputs() -> tuple[Any, ...]:

@@ -42,8 +42,8 @@ def parameters() -> Any:
         obs = jax.tree.map(lambda x: x[0], frames())
         return module(module.prepare(WORDS), obs, ACTION[0])
 
-    params = ENCODER.init(jax.random.key(0), method=both)["params"]
-    params = samples.randomised(params)
+    initialise = functools.partial(ENCODER.init, method=both)
+    params = samples.randomised(jax.eval_shape(initialise, jax.random.key(0))["params"])
     return {**params, "kernel2": abs(params["kernel2"])}  # or the last ReLU lets nothing through
 
 

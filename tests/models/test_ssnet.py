@@ -106,7 +106,7 @@ def test_the_gradient_is_that_of_the_published_equations(taped: bool) -> None:
 def test_the_whole_network_is_the_published_one() -> None:
     """The last action probabilities enter the LSTM as they are."""
     model = ActorCritic(encoder, hidden=H)
-    weights = samples.randomised(model.initialise(jax.random.key(0), WORDS))
+    weights = samples.parameters(model, WORDS)
     obs, fresh = observations(B), jnp.asarray([True, False, False, True])
     rng = np.random.default_rng(0)
     previous = jnp.asarray(rng.dirichlet(np.ones(6), B), jnp.float32)

@@ -36,7 +36,8 @@ def parameters(attention: bool = True, siamese: bool = True) -> Any:
     def both(module: TDANetEncoder, words: jax.Array) -> jax.Array:
         return module(module.prepare(words), observations(2), None)
 
-    made = module.init(jax.random.key(0), jnp.asarray(samples.words()), method=both)
+    initialise = functools.partial(module.init, method=both)
+    made = jax.eval_shape(initialise, jax.random.key(0), jnp.asarray(samples.words()))
     return samples.randomised(made["params"])
 
 
