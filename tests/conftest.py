@@ -38,10 +38,13 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _compiled.name
     os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(2**31)
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
+    # Compiling takes most of the time. As it is shipped: JAX_DISABLE_MOST_OPTIMIZATIONS=0 pytest
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 for _name, _convert in {
     "jax_compilation_cache_dir": str,
     "jax_compilation_cache_max_size": int,
     "jax_persistent_cache_min_compile_time_secs": float,
+    "jax_disable_most_optimizations": lambda value: value != "0",
 }.items():
     jax.config.update(_name, _convert(os.environ[_name.upper()]))
 
