@@ -141,7 +141,8 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
     """
     from tdanet_jax.task import load_task
 
-    for precision in command.precisions:
+    acts = {"rollout", "update"} & set(command.parts)
+    for precision in command.precisions if acts else ():
         network = NetworkConfig(precision=precision)
         task = load_task(TrainConfig(model=name, network=network, data=command.data))
         for count in command.batches:

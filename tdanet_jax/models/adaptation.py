@@ -15,8 +15,7 @@ and an environment keeps the pairs (x_t, d_t) of its inner steps instead of a ma
 dense layers around the LSTM it keeps its own part of the parameters as it is (`layers.OWN`).
 What an encoder takes once for all environments (`prepare`), layers that it shares among them
 (`Encoder.SHARED`), and dense layers of over 65,536 weights, are not adapted; SAVN has none of the
-latter two. A test compares with plain per-environment
-parameters, in value and in gradient.
+latter two. A test compares with plain per-environment parameters, in value and in gradient.
 
 In training, all environments take their inner steps together, after every k steps of a rollout: an
 episode adapts for the first time where such a stretch of k steps first lies within it, and a

@@ -14,11 +14,10 @@ from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig
 from tdanet_jax.env import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.image import DROPOUT_UNITS, ImageTable, ImageTrunk, image_alone
+from tdanet_jax.models.image import ImageEncoder, ImageTable, ImageTrunk, image_alone
 
 
-class BaselineEncoder(Encoder):
+class BaselineEncoder(ImageEncoder):
     """The image trunk and nothing else.
 
     Attributes:
@@ -27,14 +26,6 @@ class BaselineEncoder(Encoder):
     """
 
     dtype: Any = jnp.float32
-
-    IMAGE = True
-    ACTION = "inside"
-
-    @property
-    def dropout_units(self) -> int:
-        """The units of the trunk."""
-        return DROPOUT_UNITS
 
     def setup(self) -> None:
         self.trunk = ImageTrunk(self.maps, self.dropout, self.dtype)

@@ -27,6 +27,7 @@ from flax import linen as nn
 from flax import struct
 
 from tdanet_jax.env import RASTER, Observation
+from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import Linear
 
 #: Cells of an image.
@@ -123,6 +124,18 @@ class ImageTrunk(nn.Module):
             return x
         kept = keep.reshape(*keep.shape[:-1], 2, CELLS, CHANNELS)[..., layer, :, :]
         return jnp.where(kept, x / (1 - self.dropout), 0.0)
+
+
+class ImageEncoder(Encoder):
+    """An encoder with an image trunk, into which the previous action goes."""
+
+    IMAGE = True
+    ACTION = "inside"
+
+    @property
+    def dropout_units(self) -> int:
+        """The units of the trunk."""
+        return DROPOUT_UNITS
 
 
 def image_alone(obs: Observation, maps: bool) -> Observation:

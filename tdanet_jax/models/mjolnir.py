@@ -32,7 +32,7 @@ from tdanet_jax.models import convolutions
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.convolutions import Convolutions
 from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.image import CHANNELS, DROPOUT_UNITS, ImageTable, ImageTrunk
+from tdanet_jax.models.image import CHANNELS, ImageEncoder, ImageTable, ImageTrunk
 from tdanet_jax.models.layers import Linear, not_negative
 from tdanet_jax.models.rows import (
     COLUMNS,
@@ -163,7 +163,7 @@ class MjolnirOEncoder(Encoder):
         return rows_alone(obs, self.classes.known)
 
 
-class MjolnirREncoder(Encoder):
+class MjolnirREncoder(ImageEncoder):
     """MJOLNIR-r: the features of the image and of the graph.
 
     Attributes:
@@ -178,13 +178,6 @@ class MjolnirREncoder(Encoder):
     dtype: Any = jnp.float32
 
     ROWS = "class"
-    IMAGE = True
-    ACTION = "inside"
-
-    @property
-    def dropout_units(self) -> int:
-        """The units of the trunk."""
-        return DROPOUT_UNITS
 
     def setup(self) -> None:
         self.trunk = ImageTrunk(self.maps, self.dropout, self.dtype)

@@ -23,8 +23,7 @@ from tdanet_jax.env import Observation
 from tdanet_jax.models import convolutions
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.convolutions import Convolutions
-from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.image import DROPOUT_UNITS, ImageTable, ImageTrunk
+from tdanet_jax.models.image import ImageEncoder, ImageTable, ImageTrunk
 from tdanet_jax.models.layers import Linear, not_negative
 
 
@@ -36,7 +35,7 @@ class SceneTable(struct.PyTreeNode):
     node: jax.Array  # [C + 1] int32, node of a class; n where it has none
 
 
-class ScenePriorsEncoder(Encoder):
+class ScenePriorsEncoder(ImageEncoder):
     """The image trunk and the class graph.
 
     Attributes:
@@ -53,14 +52,6 @@ class ScenePriorsEncoder(Encoder):
     features: int = 512
     width: int = 1024
     dtype: Any = jnp.float32
-
-    IMAGE = True
-    ACTION = "inside"
-
-    @property
-    def dropout_units(self) -> int:
-        """The units of the trunk."""
-        return DROPOUT_UNITS
 
     def setup(self) -> None:
         init = nn.initializers.he_uniform()
