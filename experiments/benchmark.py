@@ -318,8 +318,8 @@ def environment_row(task: Task, count: int, observed: bool, repeats: int, mesh: 
         keys = jax.random.split(reset_key, count)
         state = split(jax.vmap(env.reset_state, (0, None))(keys, params))
 
-        def body(carry: tuple, key: jax.Array) -> tuple[tuple, jax.Array]:
-            state, obs = carry
+        def body(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
+            state, obs, total = carry
             action_key, step_key = jax.random.split(key)
             action = jax.random.randint(action_key, (count,), 0, NUM_ACTIONS, jnp.uint8)
             keys = jax.random.split(step_key, count)
@@ -327,12 +327,13 @@ def environment_row(task: Task, count: int, observed: bool, repeats: int, mesh: 
                 keys, state, action, params
             )
             state, following = split((state, following))
-            return (state, following if observed else obs), reward.sum()
+            return (state, following if observed else obs, total + reward), None
 
         # What is carried is written in every step, and returned, so that it cannot be left out.
         obs = split(jax.vmap(env.observe, (0, None))(state, params))
-        (_, obs), rewards = jax.lax.scan(body, (state, obs), jax.random.split(key, steps))
-        return rewards.sum(), obs
+        total = split(jnp.zeros(count))
+        (_, obs, total), _ = jax.lax.scan(body, (state, obs, total), jax.random.split(key, steps))
+        return total, obs
 
     first, seconds = timed(lambda: play(jax.random.key(0), params), repeats)
     return {
