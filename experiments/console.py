@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
 import io
 import itertools
 import signal
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -28,6 +30,9 @@ from rich.text import Text
 from tdanet_jax.files import LOCK_FILE, PARTIAL
 
 Arguments = TypeVar("Arguments")
+
+#: Without a terminal, progress is a line at most this often.
+SECONDS_BETWEEN_LINES = 10.0
 
 console = Console(stderr=False, highlight=False, soft_wrap=True)
 
@@ -183,14 +188,14 @@ def progress_bar(transient: bool) -> Progress:
 
 
 @contextlib.contextmanager
-def reporter(
-    title: str, every: int = 1, transient: bool = False
-) -> Iterator[Callable[[float, str], None]]:
+def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, str], None]]:
     """Shows progress: `report(share, figures)`, a live bar on a terminal, else a line now and then.
+
+    Without a terminal the first report, the last, and those in between that come at least ten
+    seconds after the line before are printed, with the time left at the pace since the first.
 
     Args:
       title: what is going on.
-      every: without a terminal, print only every so many reports.
       transient: on a terminal, take the bar away at the end.
     """
     if console.is_terminal:
@@ -202,13 +207,21 @@ def reporter(
 
             yield live
         return
-    count = 0
+    first: tuple[float, float] | None = None  # time and share of the first report
+    printed = 0.0
 
     def plain(share: float, figures: str) -> None:
-        nonlocal count
-        count += 1
-        if count % every == 0 or share >= 1.0:
-            console.print(f"{title} {100 * min(share, 1.0):5.1f} %  {figures}")
+        nonlocal first, printed
+        now, share, left = time.monotonic(), min(share, 1.0), ""
+        if first is not None and now - printed < SECONDS_BETWEEN_LINES and share < 1.0:
+            return
+        if first is None:
+            first = now, share
+        elif first[1] < share < 1.0:
+            seconds = round((now - first[0]) * (1.0 - share) / (share - first[1]))
+            left = f"  {datetime.timedelta(seconds=seconds)} left"
+        printed = now
+        console.print(f"{title} {100 * share:5.1f} %  {figures}{left}".rstrip())
 
     yield plain
 

@@ -152,7 +152,7 @@ def evaluate_several(command: Command, networks: Sequence[Saved], folder: Path) 
 
     results, records = {}, []
     greedy = command.policy == "greedy"
-    with reporter("evaluating", every=10) as show:
+    with reporter("evaluating") as show:
         for done in saved.evaluate(networks, greedy, command.seed):
             results[done.saved] = done.results()
             where = {"run": str(done.saved.run), "updates": done.snapshot.updates}

@@ -76,7 +76,7 @@ def load_rooms(choice: Choice, runs: Sequence[Path]) -> Rooms:
     data = choice.data
     if data is None:
         data = configs.load(folder_of(runs[0]) / CONFIG_FILE).data
-    with reporter("rooms", every=30, transient=True) as report:
+    with reporter("rooms", transient=True) as report:
         return dataset.load_rooms(data, lambda done, total: report(done / total, "rebuilt"))
 
 

@@ -90,7 +90,7 @@ def _trains(index: int) -> bool:
 def _bundled() -> SceneTables:
     from tdanet_jax.scenes import load_tables
 
-    with reporter("rooms", every=30) as report:
+    with reporter("rooms") as report:
         return load_tables(lambda done, total: report(done / total, "rebuilt"))
 
 
@@ -304,7 +304,7 @@ def _rebuilt(path: Path) -> SceneTables:
 
     rooms = metadata.read_scenes(path)
     metadata.check_classes(rooms)
-    with reporter("rooms", every=10) as report:
+    with reporter("rooms") as report:
         return scene_tables.build(
             rooms, progress=lambda done, total: report(done / total, "rebuilt")
         )
@@ -336,7 +336,7 @@ class Export:
 
         if self.out.exists():
             fail(f"--out {self.out}: exists")
-        with reporter("rooms", every=30, transient=True) as rebuilt:
+        with reporter("rooms", transient=True) as rebuilt:
             rooms = dataset.load_rooms(self.data, lambda n, total: rebuilt(n / total, "rebuilt"))
         tables, extras = rooms.tables, rooms.extras
         parents = extras.parents if extras and extras.parents else named_parents(tables)
@@ -345,7 +345,7 @@ class Export:
         vectors = None
         if self.vectors:
             vectors = words.load(self.word_vectors, tables.classes).table(tables.classes, None)
-        with reporter("export", every=30) as report:
+        with reporter("export") as report:
             exporter.write_folder(tables, self.out, report, parents, vectors, self.features)
         console.print(f"{self.out}")
 

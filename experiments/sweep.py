@@ -155,7 +155,7 @@ def train_together(members: Sequence[tuple[TrainConfig, Path]]) -> None:
     from tdanet_jax.training import Run
 
     with stoppable(lambda: "every seed is saved") as stop, contextlib.ExitStack() as locks:
-        with reporter("rooms", every=30, transient=True) as show:
+        with reporter("rooms", transient=True) as show:
             task = load_task(members[0][0], lambda done, total: show(done / total, "rebuilt"))
         lists = episodes.load(task.tables, task.split, task.extras)
         runs = []
@@ -180,7 +180,7 @@ def learn_together(runs: Sequence[Run], stop: StopRequest) -> None:
 
     saved = save()  # who cannot save learns it before training, not after
     console.print("compiling ...")
-    with stop.deferred(), reporter("training", every=10) as show:
+    with stop.deferred(), reporter("training") as show:
         for rows in chunks_together(runs):
             show(runs[0].progress, f"{len(rows)} seeds, each: {figures_of(rows[0])}")
             if stop.signal is not None:
@@ -199,7 +199,7 @@ def write_report(out: Path, runs: Sequence[Finished]) -> None:
     check_alike(runs)
     out.mkdir(parents=True, exist_ok=True)
     with files.locked(out):
-        with reporter("histories", every=20) as show:
+        with reporter("histories") as show:
             for run, points in sweep.histories(runs, out, EVALUATION_SEED):
                 show(points / max(run.config.history, points), run.folder.name)
         curves = sweep.make_curves(runs, out)

@@ -126,7 +126,7 @@ def train(config: TrainConfig, folder: Path, command: Command) -> None:
         mesh = devices.connect(command.devices)
         devices.keep_compiled()
         console.quiet = not devices.is_lead()
-        with reporter("rooms", every=30, transient=True) as report_rooms:
+        with reporter("rooms", transient=True) as report_rooms:
             task = load_task(config, lambda done, total: report_rooms(done / total, "rebuilt"))
         lists = episodes.load(task.tables, task.split, task.extras)
         # What `auto` means here is part of the run: it goes on with the same products elsewhere.
@@ -180,7 +180,7 @@ def learn(run: Run, tensorboard: bool, stop: StopRequest) -> None:
     console.print("compiling ...")
     with (
         stop.deferred(),
-        reporter("training", every=10) as show,
+        reporter("training") as show,
         metrics_sink(run.folder, tensorboard) as sink,
     ):
         for row in run.chunks():
