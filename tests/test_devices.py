@@ -5,9 +5,12 @@ import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import pytest
 
-from tdanet_jax import devices
+from tdanet_jax import devices, learner
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.task import make_task
 
 #: In a process of its own, which alone can split its CPU into eight devices.
 EIGHT = """
@@ -68,3 +71,19 @@ def test_a_process_on_its_own_agrees_with_itself():
     assert devices.from_lead(0.1) == 0.1
     assert devices.anywhere(True)
     assert not devices.anywhere(False)
+
+
+@pytest.mark.parametrize("model", ["tdanet", "mjolnir-r", "savn"])
+def test_an_update_can_be_lowered_for_a_gpu(some_rooms, glove, model):
+    # Not what it computes there, which needs one: that no part of it exists on CPUs alone.
+    learning = LearnerConfig(num_envs=4, rollout_steps=6)
+    network = NetworkConfig(precision="bfloat16")
+    config = TrainConfig(model=model, network=network, learner=learning)
+    task = make_task(config, some_rooms, glove)
+    arguments = task.train_words, task.train_params
+    state = jax.eval_shape(
+        lambda: learner.init(jax.random.key(0), learning, task.model, *arguments)
+    )
+    traced = learner.make_train(learning, task.model, 1).trace(state, jnp.zeros(2), *arguments)
+    program = traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert "dot_general" in program
