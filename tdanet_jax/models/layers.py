@@ -204,15 +204,20 @@ class Linear(nn.Module):
         bias: Any = 0.0
         if self.use_bias:
             bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        # One row per environment is recorded; products over more than that are taken again.
-        records = self.is_mutable_collection(TAPE) and x.ndim == 2
-        if self.has_variable(TAPE, "product") and not self.is_mutable_collection(TAPE):
-            return recall_product(x, kernel, self.dtype, *self.get_variable(TAPE, "product")) + bias
+        taken: tuple = self.get_variable(TAPE, "product", ())
+        if not self.is_mutable_collection(TAPE):
+            # What is recorded may be of another call: of fewer rows, or of a table of classes.
+            if taken and taken[0].shape == (*x.shape[:-1], self.features):
+                return recall_product(x, kernel, self.dtype, *taken) + bias
+            return product(x, kernel, self.dtype) + bias + self.own(x)
         y = product(x, kernel, self.dtype)
-        if records:
+        # One row per environment is recorded; products over more than that are taken again, and so
+        # are those of a layer that is called twice.
+        if x.ndim == 2:
             kept = _keeps_transposed(self.dtype)
             transposed = _pack(x.astype(self.dtype).T) if kept else None
-            self.put_variable(TAPE, "product", (y, transposed))
+            once = not self.has_variable(TAPE, "product")
+            self.put_variable(TAPE, "product", (y, transposed) if once else ())
         return y + bias + self.own(x)
 
     @property

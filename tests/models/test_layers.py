@@ -144,6 +144,43 @@ def test_the_tape_gives_the_recorded_values_and_the_plain_gradient(seed: int) ->
     chex.assert_trees_all_close(fast, jax.grad(plain, (0, 1, 2))(params, carry, x), **CLOSE)
 
 
+class Twice(nn.Module):
+    """One dense layer of two inputs, of a table without environments, and of rows."""
+
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, a: jax.Array, b: jax.Array, table: jax.Array) -> jax.Array:
+        layer, other, third = Linear(2, self.dtype), Linear(2, self.dtype), Linear(2, self.dtype)
+        rows = third(jnp.stack([a, b], axis=-2)).sum(axis=-2)
+        return abs(layer(a) - layer(b)) + other(table).sum(axis=0) + rows * third(a)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+def test_layers_that_are_called_twice_have_the_plain_gradient(dtype: Any) -> None:
+    a, b, table = normal(T, B, N), normal(T, B, N, seed=1), normal(6, N, seed=2)
+    params = randomised(
+        jax.eval_shape(Twice().init, jax.random.key(0), a[0], b[0], table)["params"], seed=3
+    )
+    model, weight = Twice(dtype), normal(T, B, 2, seed=4)
+
+    def act(carry: None, inputs: Any) -> Any:
+        out, tape = model.apply({"params": params}, *inputs, table, mutable=[TAPE])
+        return None, (out, tape[TAPE])
+
+    _, (out, tape) = jax.lax.scan(act, None, (a, b))
+
+    def loss(params: Any, tape: Any) -> Any:
+        y = model.apply({"params": params, **tape}, a, b, table)
+        return (y * weight).sum(), y
+
+    (_, y), fast = jax.value_and_grad(loss, has_aux=True)(params, {TAPE: tape})
+    (_, z), plain = jax.value_and_grad(loss, has_aux=True)(params, {})
+    close = CLOSE if dtype == jnp.float32 else {"rtol": 2e-2, "atol": 1e-2}
+    chex.assert_trees_all_close((y, y), (out, z), **close)
+    chex.assert_trees_all_close(fast, plain, **close)
+
+
 def test_values_come_from_the_tape_and_not_from_new_work() -> None:
     params, carry, x, fresh = example(seed=20)
     _, (out, tape) = recorded(params, carry, x, fresh)
