@@ -25,6 +25,9 @@ from tdanet_jax.models.layers import Carry
 from tdanet_jax.returns import advantages
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
+#: Parameters of more numbers than this have operands of the network's precision while acting.
+SMALL = 2**16
+
 
 class TrainState(struct.PyTreeNode):
     """All that a run needs to go on exactly where it was."""
@@ -66,10 +69,19 @@ class Rollout(NamedTuple):
 
 
 def make_optimizer(config: LearnerConfig) -> optax.GradientTransformation:
-    """Clipping and Adam; the learning rate is applied in `update`, which knows the progress."""
-    scale = optax.scale_by_amsgrad if config.amsgrad else optax.scale_by_adam
+    """Clipping and Adam; the learning rate is applied in `update`, which knows the progress.
+
+    AMSGrad is PyTorch's: the largest second moment is taken before the correction for its start.
+    Of corrected ones, the first few gradients would be the largest for good.
+    """
+    clip, epsilon = optax.clip_by_global_norm(config.max_grad_norm), config.adam_epsilon
+    if not config.amsgrad:
+        return optax.chain(clip, optax.scale_by_adam(eps=epsilon))
+    decay = 0.999
     return optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm), scale(eps=config.adam_epsilon)
+        clip,
+        optax.scale_by_amsgrad(b2=decay, eps=epsilon, bias_correction_nu=False),
+        optax.scale_by_schedule(lambda count: jnp.sqrt(1.0 - decay ** (count + 1.0))),
     )
 
 
@@ -114,8 +126,10 @@ def rollout(
     """
     observe = jax.vmap(env.observe, (0, None))
     transition = jax.vmap(env.transition, (0, 0, None))
-    # Cast once per rollout what every step would cast.
-    weights = jax.tree.map(lambda x: x.astype(model.dtype) if x.ndim > 1 else x, state.params)
+    # Cast once per rollout what every step would cast: the kernels of the large products.
+    weights = jax.tree.map(
+        lambda x: x.astype(model.dtype) if x.ndim > 1 and x.size > SMALL else x, state.params
+    )
     table = actor_critic.prepare(model, state.params, words)
     rate = model.encoder.dropout
     batch, units = state.fresh.shape[0], model.encoder.dropout_units
@@ -259,7 +273,20 @@ def update(
         episodes=state.episodes + finished,
         skipped=state.skipped + ~finite,
     )
-    return after, {**parts, "grad_norm": grad_norm, **_episode_sums(steps)}
+    metrics = {
+        **parts,
+        "explained_variance": _explained_variance(steps, advantage),
+        "grad_norm": grad_norm,
+        "learning_rate": rate,
+    }
+    return after, metrics | _episode_sums(steps)
+
+
+def _explained_variance(steps: Rollout, advantage: jax.Array) -> jax.Array:
+    """1 - Var(return - value) / Var(return) over the steps that count; NaN if returns are alike."""
+    counted = ~steps.held
+    rest = jnp.var(advantage, where=counted)
+    return 1.0 - rest / jnp.var(steps.value + advantage, where=counted)
 
 
 def _episode_sums(steps: Rollout) -> dict[str, jax.Array]:

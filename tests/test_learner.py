@@ -25,6 +25,7 @@ from tdanet_jax.returns import advantages
 from tdanet_jax.reward import Parents
 from tests import handmade, oracle
 from tests.handmade import Room, Sighting, corridor, tables_of
+from tests.models.samples import randomised
 from tests.oracle import Episode, World, pose_of, state_of
 
 LIMITS = (4, 5, 3, 4)
@@ -259,17 +260,50 @@ def test_held_steps_do_not_count() -> None:
     )
 
 
+def torch_amsgrad(rate: float, epsilon: float) -> optax.GradientTransformation:
+    """torch.optim.Adam(amsgrad=True), line by line as PyTorch's first versions compute it."""
+
+    def init(params: Any) -> Any:
+        return (0, *(jax.tree.map(jnp.zeros_like, params) for _ in range(3)))
+
+    def step(grads: Any, memory: Any, params: Any = None) -> Any:
+        count, first, second, largest = memory
+        count += 1
+        first = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, first, grads)
+        second = jax.tree.map(lambda v, g: 0.999 * v + 0.001 * g * g, second, grads)
+        largest = jax.tree.map(jnp.maximum, largest, second)
+        size = rate * np.sqrt(1 - 0.999**count) / (1 - 0.9**count)
+        change = jax.tree.map(lambda m, v: -size * m / (jnp.sqrt(v) + epsilon), first, largest)
+        return change, (count, first, second, largest)
+
+    return optax.GradientTransformation(init, step)
+
+
+def test_amsgrad_forgets_a_large_first_gradient_no_faster_than_torch() -> None:
+    config = dataclasses.replace(CONFIG, amsgrad=True, max_grad_norm=1e9)
+    ours, theirs = learner.make_optimizer(config), torch_amsgrad(1.0, config.adam_epsilon)
+    params = jnp.zeros(3)
+    state, memory = ours.init(params), theirs.init(params)
+    for number in range(50):
+        grads = jnp.array([1.0, -2.0, 0.5]) * (100.0 if number == 0 else 1.0)
+        change, state = ours.update(grads, state, params)
+        expected, memory = theirs.update(grads, memory, params)
+        np.testing.assert_allclose(-change, expected, rtol=1e-3)
+
+
 @pytest.mark.parametrize(("amsgrad", "progress"), [(False, 0.25), (True, 0.0)])
 def test_an_update_is_one_step_of_clipped_adam_on_the_gradient_of_the_loss(
     amsgrad: bool, progress: float
 ) -> None:
     config = dataclasses.replace(CONFIG, amsgrad=amsgrad)
     state = start(5)
-    adam = optax.amsgrad if amsgrad else optax.adam
     rate = 9e-4 * (1 - progress)
     entropy = 0.01 + progress * (0.002 - 0.01)
     reference = optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm), adam(rate, eps=config.adam_epsilon)
+        optax.clip_by_global_norm(config.max_grad_norm),
+        torch_amsgrad(rate, config.adam_epsilon)
+        if amsgrad
+        else optax.adam(rate, eps=config.adam_epsilon),
     )
     memory = reference.init(state.params)
     state = state.replace(opt_state=learner.make_optimizer(config).init(state.params))
@@ -284,6 +318,32 @@ def test_an_update_is_one_step_of_clipped_adam_on_the_gradient_of_the_loss(
         assert int(state.updates) == number + 1
         # Adam divides by the gradient's own size: where that is tiny, its rounding shows.
         chex.assert_trees_all_close(state.params, expected, rtol=1e-4, atol=2e-5)
+
+
+def test_only_large_kernels_are_rounded_while_acting() -> None:
+    model = ActorCritic(TDANetEncoder(width=12, dtype=jnp.bfloat16), hidden=8, dtype=jnp.bfloat16)
+    state = begin(jax.random.key(1), CONFIG, model, WORDS, PARAMS)
+    state = state.replace(params=randomised(state.params, seed=2))
+    _, steps, _ = rollout(state, jax.random.key(3), CONFIG, model, WORDS, PARAMS)
+    assert max(x.size for x in jax.tree.leaves(state.params)) < learner.SMALL
+    obs = jax.vmap(env.observe, (0, None))(state.env_state, PARAMS)
+    table = actor_critic.prepare(model, state.params, WORDS)
+    seen = (state.carry, obs, state.previous, state.fresh)
+    _, out = actor_critic.forward(model, state.params, table, *seen)
+    np.testing.assert_allclose(steps.value[0], out.value, rtol=1e-5)
+
+
+def test_the_explained_variance_is_that_of_the_returns_that_count() -> None:
+    state, progress = start(7), jnp.float32(0)
+    key = jax.random.fold_in(state.key, 0)
+    _, steps, last = rollout(state, key, CONFIG, MODEL, WORDS, PARAMS)
+    advantage = np.asarray(advantages_of(steps, last))
+    counted = ~np.asarray(steps.held)
+    returns = (np.asarray(steps.value) + advantage)[counted]
+    _, metrics = update(state, progress, CONFIG, MODEL, WORDS, PARAMS)
+    expected = 1 - advantage[counted].var() / returns.var()
+    assert float(metrics["explained_variance"]) == pytest.approx(expected, rel=1e-3, abs=1e-4)
+    assert float(metrics["learning_rate"]) == pytest.approx(9e-4)
 
 
 def test_schedules_reach_their_end_and_stay_there() -> None:
