@@ -10,32 +10,24 @@ done twice earns nothing. The peak is the best rate of a float32 product of batc
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import functools
 import json
 import os
-import platform
-import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 from rich.table import Table
 
 from experiments.console import check_positive, console, fail, one_line_errors, parse
-from tdanet_jax import files
-from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.config import NetworkConfig, TrainConfig
 
 if TYPE_CHECKING:
-    import jax
-    from jax.sharding import Mesh
-
-    from tdanet_jax.env import EnvParams
-    from tdanet_jax.models.actor_critic import ActorCritic
+    from tdanet_jax.measure import Row
     from tdanet_jax.task import Task
 
-Row = dict[str, Any]
 Part = Literal[
     "tables", "import", "startup", "machine", "environment", "rollout", "update", "evaluation",
     "decision",
@@ -68,7 +60,7 @@ class Command:
     repeats: int = 5
     """Timed repetitions of each figure."""
     out: Path | None = None
-    """File for the figures, one JSON object per line; must not exist."""
+    """File for the figures, one JSON object per line, written as they come; must not exist."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -86,27 +78,34 @@ def main(arguments: list[str] | None = None) -> None:
         )
         for name in command.models:
             TrainConfig(model=name).check()
+        if command.checkpoint is not None:
+            from tdanet_jax import saved
+
+            saved.find(command.checkpoint)  # what is not there is noticed now, not after minutes
         rows = []
-        for row in measure(command):
-            rows.append(row)
-            console.print(json.dumps(row))
+        with contextlib.nullcontext() if command.out is None else command.out.open("x") as file:
+            for row in figures(command):
+                rows.append(row)
+                line = json.dumps(row)
+                console.print(line)
+                if file is not None:
+                    file.write(line + "\n")
+                    file.flush()
         console.print(as_table(rows))
-        if command.out is not None:
-            files.write_text(command.out, "".join(json.dumps(row) + "\n" for row in rows))
 
 
-def measure(command: Command) -> Iterator[Row]:
+def figures(command: Command) -> Iterator[Row]:
     """All figures that were asked for, one row each."""
     import jax
 
-    from tdanet_jax import devices
+    from tdanet_jax import devices, measure
     from tdanet_jax.task import load_task
 
     mesh = devices.connect(command.devices)
     yield {
         "part": "start",
         "device": str(jax.devices()[0]),
-        "processor": processor(),
+        "processor": measure.processor(),
         "jax": jax.__version__,
     }
     if "tables" in command.parts:
@@ -118,16 +117,16 @@ def measure(command: Command) -> Iterator[Row]:
         yield startup_row()
     peak = None
     if "machine" in command.parts:
-        machine = machine_row(command.repeats)
+        machine = measure.machine_row(command.repeats)
         peak = machine["float32_gflops"]
         yield machine
     if "environment" in command.parts:
         for count in command.environments:
             for observed in (False, True):
-                yield environment_row(task, count, observed, command.repeats, mesh)
+                yield measure.environment_row(task, count, observed, command.repeats, mesh)
     if "evaluation" in command.parts:
         for networks in command.networks:
-            yield evaluation_row(command.checkpoint, task, networks, command.repeats)
+            yield measure.evaluation_row(command.checkpoint, task, networks, command.repeats)
     for name in command.models:
         for row in model_rows(command, name, peak):
             yield {"part": row.pop("part"), "model": name, **row}
@@ -139,43 +138,31 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
     Args:
       peak: of float32 products, GFLOP/s; None if it was not measured.
     """
+    import jax.numpy as jnp
+
+    from tdanet_jax import measure
     from tdanet_jax.task import load_task
 
     acts = {"rollout", "update"} & set(command.parts)
-    for precision in command.precisions if acts else ():
-        network = NetworkConfig(precision=precision)
+    measured = set()
+    for asked in command.precisions if acts else ():
+        network = NetworkConfig(precision=asked)
         task = load_task(TrainConfig(model=name, network=network, data=command.data))
+        precision = jnp.dtype(task.model.dtype).name
+        if precision in measured:  # some models multiply in float32, whatever is asked for
+            continue
+        measured.add(precision)
         for count in command.batches:
             if "rollout" in command.parts:
-                yield {**rollout_row(task, count, command.repeats), "precision": precision}
+                yield {**measure.rollout_row(task, count, command.repeats), "precision": precision}
             if "update" in command.parts:
-                row = update_row(task, count, command.repeats)
-                share = share_of_peak(task, row, peak) if name == "tdanet" else {}
+                row = measure.update_row(task, count, command.repeats)
+                share = measure.share_of_peak(task, row, peak) if name == "tdanet" else {}
                 yield {**row, **share, "precision": precision}
     if "decision" in command.parts:
         task = load_task(TrainConfig(model=name, data=command.data))
         for count in (1, 1024):
-            yield decision_row(task, count, command.repeats)
-
-
-def timed(call: Callable[[], Any], repeats: int, inner: int = 1) -> tuple[float, float]:
-    """Seconds of the first call (compilation included) and the median of later ones.
-
-    A repetition makes `inner` calls; the median is per call.
-    """
-    import jax
-
-    began = time.perf_counter()
-    jax.block_until_ready(call())
-    first = time.perf_counter() - began
-    taken = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        for _ in range(inner):
-            out = call()
-        jax.block_until_ready(out)
-        taken.append((time.perf_counter() - began) / inner)
-    return first, statistics.median(taken)
+            yield measure.decision_row(task, count, command.repeats)
 
 
 def tables_row() -> Row:
@@ -224,7 +211,9 @@ def import_row(task: Task) -> Row:
         exporter.write_folder(task.tables, folder, lambda share, name: None)
         written = time.perf_counter()
         command = [sys.executable, "-m", "experiments.scenes", "import", "--from", str(folder)]
-        subprocess.run([*command, "--out", str(out)], check=True, capture_output=True)
+        done = subprocess.run([*command, "--out", str(out)], capture_output=True, text=True)
+        if done.returncode:
+            raise ValueError(f"import: {done.stderr.strip()}")
         read = time.perf_counter()
         size = sum(path.stat().st_size for path in folder.rglob("*.json"))
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
@@ -264,261 +253,13 @@ def startup_row() -> Row:
             ) as process:
                 while not metrics.exists():
                     if process.poll() is not None:
-                        raise RuntimeError("startup: the training command ended early")
+                        raise ValueError("startup: the training command ended early")
                     time.sleep(0.01)
                 row[f"seconds_{name}"] = round(time.perf_counter() - began, 2)
                 process.kill()
     began = time.perf_counter()
     subprocess.run([*train, "--help"], check=True, stdout=subprocess.DEVNULL)
     return row | {"seconds_help": round(time.perf_counter() - began, 2)}
-
-
-def machine_row(repeats: int) -> Row:
-    """The machine's own limits: matrix products and memory."""
-    import jax
-    import jax.numpy as jnp
-
-    @jax.jit
-    def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
-        return jnp.dot(a, b, preferred_element_type=jnp.float32)
-
-    add_one = jax.jit(lambda x: x + 1)
-    row: Row = {"part": "machine"}
-    for name, dtype in (("float32", jnp.float32), ("bfloat16", jnp.bfloat16)):
-        best = 0.0
-        for batch in (512, 1024, 2048):
-            a = jax.random.normal(jax.random.key(0), (batch, 1024)).astype(dtype)
-            b = jax.random.normal(jax.random.key(1), (1024, 2048)).astype(dtype)
-            _, seconds = timed(functools.partial(multiply, a, b), 4 * repeats, inner=5)
-            best = max(best, 2 * batch * 1024 * 2048 / seconds / 1e9)
-        row[f"{name}_gflops"] = round(best, 1)
-    big = jnp.zeros(2**26, jnp.float32)
-    _, seconds = timed(functools.partial(add_one, big), repeats, inner=2)
-    row["bandwidth_gb_per_s"] = round(2 * big.nbytes / seconds / 1e9, 1)
-    return row
-
-
-def environment_row(task: Task, count: int, observed: bool, repeats: int, mesh: Mesh) -> Row:
-    """Random actions, auto-reset included; with `observed`, every detection is read."""
-    import jax
-    import jax.numpy as jnp
-
-    from tdanet_jax import devices, env
-    from tdanet_jax.vocabulary import NUM_ACTIONS
-
-    steps = 64
-    params = jax.device_put(task.train_params, devices.everywhere(mesh))
-
-    def split(tree: Any) -> Any:
-        return jax.lax.with_sharding_constraint(tree, devices.split(mesh))
-
-    @jax.jit
-    def play(key: jax.Array, params: env.EnvParams) -> tuple[jax.Array, env.Observation]:
-        reset_key, key = jax.random.split(key)
-        keys = jax.random.split(reset_key, count)
-        state = split(jax.vmap(env.reset_state, (0, None))(keys, params))
-
-        def body(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
-            state, obs, total = carry
-            action_key, step_key = jax.random.split(key)
-            action = jax.random.randint(action_key, (count,), 0, NUM_ACTIONS, jnp.uint8)
-            keys = jax.random.split(step_key, count)
-            following, state, reward, *_ = jax.vmap(env.step, (0, 0, 0, None))(
-                keys, state, action, params
-            )
-            state, following = split((state, following))
-            return (state, following if observed else obs, total + reward), None
-
-        # What is carried is written in every step, and returned, so that it cannot be left out.
-        obs = split(jax.vmap(env.observe, (0, None))(state, params))
-        total = split(jnp.zeros(count))
-        (_, obs, total), _ = jax.lax.scan(body, (state, obs, total), jax.random.split(key, steps))
-        return total, obs
-
-    first, seconds = timed(lambda: play(jax.random.key(0), params), repeats)
-    return {
-        "part": "environment",
-        "environments": count,
-        "observations": observed,
-        "devices": mesh.size,
-        "compile_seconds": round(first - seconds, 2),
-        "steps_per_second": round(count * steps / seconds),
-    }
-
-
-def tdanet_forward_macs(model: ActorCritic, words_width: int) -> int:
-    """Multiply-accumulates of one forward step of TDANet, by the sizes of its layers.
-
-    What is done once per update for the table of classes is not counted.
-    """
-    from tdanet_jax.vocabulary import NUM_ACTIONS
-
-    width, hidden = model.encoder.width, model.hidden
-    encoder = (3 + words_width) * width + 3 * width * width
-    action = NUM_ACTIONS * model.action_width
-    lstm = (width + model.action_width + hidden) * 4 * hidden
-    return encoder + action + lstm + hidden * (NUM_ACTIONS + 1)
-
-
-def rollout_row(task: Task, count: int, repeats: int) -> Row:
-    """Acting alone: environment, network and what the gradient needs later."""
-    import jax
-
-    from tdanet_jax import learner
-
-    model, config = task.model, LearnerConfig(num_envs=count)
-    state = learner.init(jax.random.key(0), config, model, task.train_words, task.train_params)
-
-    @jax.jit
-    def act(state: Any, words: jax.Array, params: Any) -> Any:
-        return learner.rollout(state, jax.random.key(1), config, model, words, params)
-
-    def call() -> Any:
-        return act(state, task.train_words, task.train_params)
-
-    first, seconds = timed(call, repeats, inner=5)
-    return {
-        "part": "rollout",
-        "environments": count,
-        "compile_seconds": round(first - seconds, 2),
-        "steps_per_second": round(count * config.rollout_steps / seconds),
-    }
-
-
-def update_row(task: Task, count: int, repeats: int) -> Row:
-    """Rollout, gradient and optimiser step, as the training command runs them."""
-    cost = update_cost(task.model, task.train_words, task.train_params, count, repeats)
-    return {"part": "update", **cost}
-
-
-def share_of_peak(task: Task, update: Row, peak: float | None) -> Row:
-    """Operations of TDANet's update by hand formula, and their share of the peak."""
-    by_hand = 6 * tdanet_forward_macs(task.model, task.train_words.shape[1])
-    gflops = by_hand * update["steps_per_second"] / 1e9
-    return {
-        "megaflop_per_step_by_hand": round(by_hand / 1e6, 2),
-        "gflops": round(gflops, 1),
-        "share_of_float32_peak": round(gflops / peak, 3) if peak else None,
-    }
-
-
-def update_cost(
-    model: ActorCritic, words: jax.Array, params: EnvParams, count: int, repeats: int
-) -> Row:
-    """Time and memory of an update of `count` environments, and XLA's count of its operations.
-
-    XLA counts the body of a loop once. The work of an update is in loops over the T steps, so its
-    count over the number of environments is that of one environment step, and what is done once
-    per update comes on top.
-    """
-    import jax
-    import jax.numpy as jnp
-
-    from tdanet_jax import learner
-
-    config, updates = LearnerConfig(num_envs=count), 5
-    chunk = learner.make_train(config, model, updates)
-    state = learner.init(jax.random.key(0), config, model, words, params)
-    share = jnp.zeros(2)
-    began = time.perf_counter()
-    compiled = chunk.lower(state, share, words, params).compile()
-    compile_seconds = time.perf_counter() - began
-    memory: Any = compiled.memory_analysis()
-    cost: Any = compiled.cost_analysis()
-
-    def call() -> Any:
-        nonlocal state
-        state, metrics = compiled(state, share, words, params)
-        return metrics
-
-    _, seconds = timed(call, repeats)
-    return {
-        "environments": count,
-        "compile_seconds": round(compile_seconds, 2),
-        "steps_per_second": round(count * config.rollout_steps * updates / seconds),
-        "megaflop_per_step_compiled": round(cost["flops"] / count / 1e6, 2),
-        "kilobytes_per_step_compiled": round(cost["bytes accessed"] / count / 1e3, 1),
-        "arguments_mb": round(memory.argument_size_in_bytes / 1e6, 1),
-        "temporary_mb": round(memory.temp_size_in_bytes / 1e6, 1),
-    }
-
-
-def evaluation_row(run: Path | None, task: Task, networks: int, repeats: int) -> Row:
-    """All episodes of a split with sampled actions, for several networks in one call.
-
-    Args:
-      run: folder of a trained run, whose network plays; None takes an untrained one, which says
-        Done early and is done sooner.
-    """
-    import jax
-    import jax.numpy as jnp
-
-    from tdanet_jax import episodes, evaluation, policies, saved
-    from tdanet_jax.task import load_task
-
-    if run is None:
-        weights = task.model.initialise(jax.random.key(0), task.words)
-    else:
-        network = saved.find(run)[0]
-        task, weights = load_task(network.config), network.load().weights
-    stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * networks), weights)
-    policy = policies.network(task.model, task.words)
-    lists = episodes.load(task.tables, task.split, task.extras)
-
-    def call() -> Any:
-        played = evaluation.evaluate_stacked(policy, stacked, task.eval_params, lists, 0)
-        return [records.length for one in played for _, records in one.values()]
-
-    first, seconds = timed(call, repeats)
-    return {
-        "part": "evaluation",
-        "networks": networks,
-        "trained": run is not None,
-        "episodes": networks * sum(len(chosen) for chosen in lists.values()),
-        "compile_seconds": round(first - seconds, 2),
-        "seconds": round(seconds, 2),
-    }
-
-
-def decision_row(task: Task, count: int, repeats: int) -> Row:
-    """One decision of an untrained model: an observation in, action probabilities out."""
-    import jax
-    import jax.numpy as jnp
-
-    from tdanet_jax import env, parameters
-    from tdanet_jax.models import actor_critic
-
-    model = task.model
-    weights = jax.jit(model.initialise)(jax.random.key(0), task.words)
-    table = jax.jit(actor_critic.prepare, static_argnums=0)(model, weights, task.words)
-    keys = jax.random.split(jax.random.key(1), count)
-    obs, _ = jax.jit(jax.vmap(env.reset, (0, None)))(keys, task.eval_params)
-    carry, fresh = model.initial_carry(count, weights), jnp.zeros(count, bool)
-    previous = jnp.zeros((count, 6))
-
-    @jax.jit
-    def decide(weights: Any, table: Any, carry: Any, obs: Any) -> Any:
-        return actor_critic.forward(model, weights, table, carry, obs, previous, fresh)
-
-    inner = 20 if count == 1 else 1
-    first, seconds = timed(lambda: decide(weights, table, carry, obs), 4 * repeats, inner)
-    return {
-        "part": "decision",
-        "batch": count,
-        "parameters": parameters.count(model, *task.words.shape).trained,
-        "compile_seconds": round(first - seconds, 2),
-        "milliseconds": round(1e3 * seconds, 3),
-    }
-
-
-def processor() -> str:
-    """The processor's name, as far as the system tells."""
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def as_table(rows: list[Row]) -> Table:

@@ -2,9 +2,9 @@
 
     python -m experiments.scaling --out scaling
 
-One size is changed at a time, the others stay as they are by default. More rooms are the 120 rooms
-repeated, more classes and detections are rows that never occur: what is measured is their size.
-Writes scaling.jsonl and scaling.png into --out.
+One size is changed at a time, the others stay as they are by default. More rooms are the 80
+training rooms repeated, more classes and detections are rows that never occur: what is measured is
+their size. Writes scaling.jsonl and scaling.png into --out.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.benchmark import Row, update_cost
 from experiments.console import (
     check_empty,
     check_positive,
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tdanet_jax.env import EnvParams
+    from tdanet_jax.measure import Row
     from tdanet_jax.scenes import SceneTables
     from tdanet_jax.task import Task
 
@@ -43,8 +43,8 @@ class Command:
     """Numbers of environments."""
     rooms: tuple[int, ...] = (10, 30, 80, 250, 1000)
     """Numbers of training rooms; 80 are there."""
-    classes: tuple[int, ...] = (118, 250, 500, 1000, 2000)
-    """Sizes of the vocabulary; at least 118."""
+    classes: tuple[int, ...] = (117, 250, 500, 1000, 2000)
+    """Sizes of the vocabulary; at least 117."""
     detections: tuple[int, ...] = (74, 128, 256, 512)
     """Rows of an observation; at least as many as a frame can hold."""
     repeats: int = 3
@@ -93,6 +93,7 @@ def measure(command: Command, task: Task) -> Iterator[Row]:
     import jax.numpy as jnp
 
     from tdanet_jax.config import LearnerConfig
+    from tdanet_jax.measure import update_cost
 
     count = LearnerConfig().num_envs
     model, words, params = task.model, task.train_words, task.train_params

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING
 import tyro
 
 from experiments import train_zero_shot
-from experiments.benchmark import decision_row, processor
 from experiments.console import (
     StopRequest,
     check_positive,
@@ -192,7 +191,7 @@ def learn_together(runs: Sequence[Run], stop: StopRequest) -> None:
 
 def write_report(out: Path, runs: Sequence[Finished]) -> None:
     """Evaluates what is missing, and writes the report."""
-    from tdanet_jax import figures, files, report
+    from tdanet_jax import figures, files, measure, report
 
     if not runs:
         fail(f"{out}: no finished run")
@@ -209,7 +208,7 @@ def write_report(out: Path, runs: Sequence[Finished]) -> None:
             untrained=sweep.untrained(runs, EVALUATION_SEED),
             costs=costs(runs),
             curves=curves,
-            machine=processor(),
+            machine=measure.processor(),
             code=report.code_version(),
         )
         names = {split: f"learning_curve-{split.replace('/', '-')}.png" for split in curves}
@@ -233,13 +232,14 @@ def check_alike(runs: Sequence[Finished]) -> None:
 
 def costs(runs: Sequence[Finished]) -> dict[str, Cost]:
     """Parameters and inference time of every model among the runs, on this machine."""
+    from tdanet_jax import measure
     from tdanet_jax.task import load_task
 
     out: dict[str, Cost] = {}
     for run in runs:
         if run.config.model not in out:
             task = load_task(run.config)
-            rows = {batch: decision_row(task, batch, repeats=5) for batch in BATCHES}
+            rows = {batch: measure.decision_row(task, batch, repeats=5) for batch in BATCHES}
             out[run.config.model] = Cost(
                 parameters=rows[BATCHES[0]]["parameters"],
                 milliseconds={batch: row["milliseconds"] for batch, row in rows.items()},

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from experiments import benchmark
+from tdanet_jax import measure
 from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.task import make_model
@@ -32,6 +33,29 @@ def test_a_second_start_finds_what_the_first_has_compiled(ithor, tmp_path):
     assert 0 < row["seconds_compiled_before"] < row["seconds_nothing_compiled"]
 
 
+def test_a_wrong_folder_ends_before_anything_is_measured(tmp_path, capsys):
+    out = tmp_path / "figures.jsonl"
+    for flags in (
+        ["--checkpoint", "nowhere", "--out", str(out)],
+        ["--out", "nowhere/figures.jsonl"],
+    ):
+        with pytest.raises(SystemExit) as ended:
+            benchmark.main(["--parts", "machine", *flags])
+        assert ended.value.code == 2
+        said = capsys.readouterr()
+        assert "nowhere" in said.err
+        assert "gflops" not in said.out
+    assert not out.exists()
+
+
+def test_a_model_that_multiplies_in_float32_alone_is_measured_once(ithor, tmp_path):
+    out = tmp_path / "figures.jsonl"
+    arguments = ["--parts", "rollout", "--models", "savn", "--batches", "2", "--repeats", "1"]
+    benchmark.main([*arguments, "--out", str(out)])
+    rows = [json.loads(line) for line in out.read_text().splitlines()][1:]
+    assert [(row["model"], row["precision"]) for row in rows] == [("savn", "float32")]
+
+
 def test_decisions_of_any_model_are_timed(ithor, tmp_path):
     out = tmp_path / "figures.jsonl"
     arguments = ["--parts", "decision", "--models", "ssnet", "--repeats", "1", "--out"]
@@ -48,7 +72,7 @@ def test_the_hand_formula_counts_the_kernels_that_a_step_uses():
     weights = jax.eval_shape(model.initialise, jax.random.key(0), jnp.ones((5, 50)))
     del weights["encoder"]["attention"]
     kernels = sum(leaf.size for leaf in jax.tree.leaves(weights) if leaf.ndim == 2)
-    assert benchmark.tdanet_forward_macs(model, 50) == kernels
+    assert measure.tdanet_forward_macs(model, 50) == kernels
 
 
 def test_an_evaluation_plays_the_networks_of_a_run_in_one_call(ithor, tmp_path):
