@@ -54,8 +54,8 @@ class Command:
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""
     resume: Path | None = None
-    """Folder of a run to go on with, to its original budget; beside it, --devices and
-    --tensorboard alone."""
+    """Folder of a run to go on with; beside it, --devices, --tensorboard and a new budget, which
+    replaces the run's (its schedules then follow the new one)."""
     tensorboard: bool = False
     """Also write TensorBoard events (needs tensorboardX)."""
     devices: int = 1
@@ -80,14 +80,7 @@ def main(arguments: list[str] | None = None) -> None:
     with one_line_errors():
         command = parse_command(words)
         if command.resume is not None:
-            if dataclasses.replace(command, devices=1, tensorboard=False) != Command(
-                run=TrainConfig(), resume=command.resume
-            ):
-                fail(
-                    "--resume goes on to the original budget: beside it, --devices and "
-                    "--tensorboard alone"
-                )
-            folder, config = command.resume, configs.load(command.resume / CONFIG_FILE)
+            folder, config = command.resume, resumed(command)
         else:
             config = command.run
             config.check()
@@ -102,6 +95,23 @@ def main(arguments: list[str] | None = None) -> None:
         if command.tensorboard and importlib.util.find_spec("tensorboardX") is None:
             fail("--tensorboard needs tensorboardX: pip install 'tdanet-jax[tensorboard]'")
         train(config, folder, command)
+
+
+def resumed(command: Command) -> TrainConfig:
+    """The configuration of the run to go on with, with the new budget if there is one."""
+    new, folder = command.run, command.resume
+    others = dataclasses.replace(command, run=TrainConfig(), devices=1, tensorboard=False)
+    if others != Command(run=TrainConfig(), resume=folder) or new != TrainConfig().with_budget(new):
+        fail(
+            "--resume goes on as the run began: beside it, a new budget (--steps, --episodes, "
+            "--minutes), --devices and --tensorboard alone"
+        )
+    assert folder is not None
+    config = configs.load(folder / CONFIG_FILE)
+    if new != TrainConfig():
+        config = config.with_budget(new)
+        config.check()
+    return config
 
 
 def check_new(folder: Path) -> None:
@@ -120,7 +130,7 @@ def train(config: TrainConfig, folder: Path, command: Command) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
     with stoppable(lambda: how_to_go_on(folder)) as stop:
         from tdanet_jax import devices, episodes, files
-        from tdanet_jax.task import load_task, resolve
+        from tdanet_jax.task import load_task, resolve, without_effect
         from tdanet_jax.training import Run
 
         mesh = devices.connect(command.devices)
@@ -129,6 +139,8 @@ def train(config: TrainConfig, folder: Path, command: Command) -> None:
         with reporter("rooms", transient=True) as report_rooms:
             task = load_task(config, lambda done, total: report_rooms(done / total, "rebuilt"))
         lists = episodes.load(task.tables, task.split, task.extras)
+        for flag in without_effect(config, task.classes) if command.resume is None else ():
+            console.print(f"note: {flag} changes nothing for {config.model}")
         # What `auto` means here is part of the run: it goes on with the same products elsewhere.
         config = resolve(config)
         with files.locked(folder) if devices.is_lead() else contextlib.nullcontext():
@@ -198,10 +210,14 @@ def learn(run: Run, tensorboard: bool, stop: StopRequest) -> None:
 def figures_of(row: Row) -> str:
     """The figures beside the progress bar."""
     skipped = f"  {row['skipped']} updates skipped" if row["skipped"] else ""
+
+    def shown(name: str, factor: float, digits: int) -> str:
+        return "-" if row[name] is None else f"{factor * row[name]:.{digits}f}"
+
     return (
         f"{row['steps_per_second']:,.0f} steps/s  {row['episodes']:,} episodes  "
-        f"SR {100 * row['success']:.1f}  SPL {100 * row['spl']:.1f}  "
-        f"entropy {row['entropy']:.2f}{skipped}"
+        f"SR {shown('success', 100, 1)}  SPL {shown('spl', 100, 1)}  "
+        f"entropy {shown('entropy', 1, 2)}{skipped}"
     )
 
 
@@ -230,7 +246,7 @@ def metrics_sink(folder: Path, tensorboard: bool) -> Iterator[Callable[[Row], No
             if writer is None:
                 (folder / "tensorboard").mkdir(exist_ok=True)
                 writer = EventsWriter(str(folder / "tensorboard" / "events"))
-            for name in (name for name in row if name != "steps"):
+            for name in (name for name in row if name != "steps" and row[name] is not None):
                 summary = scalar(f"train/{name}", row[name])
                 writer.write_event(Event(wall_time=time.time(), step=row["steps"], summary=summary))
             writer.flush()

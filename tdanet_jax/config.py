@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -27,8 +29,14 @@ MODELS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "savn": ("tdanet_jax.models.savn", {}),
     "li": ("tdanet_jax.models.li", {}),
 }
+#: Budget in environment steps where none is given.
+DEFAULT_STEPS = 12_000_000
+#: What a run's budget can be given in; it ends when one of those given is spent.
+BUDGETS = ("steps", "episodes", "minutes")
 #: Name of the file in a run's folder that holds its configuration.
 CONFIG_FILE = "config.json"
+#: Environment variable: modules of models of one's own that runs on disk may name, with commas.
+TRUST = "TDANET_TRUST"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,10 +120,11 @@ class TrainConfig:
     priors; sp-wide in the published size), savn (the baseline, which goes on learning while it
     acts), li (mjolnir-o, which does so, too), or the dotted name of a module of your own that has a
     function `make` (docs/models.md)."""
-    steps: int = 12_000_000
-    """Budget in environment steps (actions)."""
+    steps: int | None = None
+    """Stop after this many environment steps (actions); of several budgets, at the one that is
+    spent first. 12,000,000 where no budget is given."""
     episodes: int | None = None
-    """Stop after this many training episodes instead; the paper's budget is 6,000,000."""
+    """Stop after this many training episodes; the paper's budget is 6,000,000."""
     minutes: float | None = None
     """Stop after this much training time, tables, compilation and evaluation not counted."""
     seed: int = 0
@@ -136,7 +145,8 @@ class TrainConfig:
     """Points of the budget, evenly spaced, at which the parameters are kept for the learning curve
     of `experiments.evaluate --history`; 0 keeps none. A point of TDANet takes 12 MB."""
     max_skipped: int = 20
-    """Stop after this many updates that were skipped for a loss or gradient that is not finite."""
+    """Stop after this many updates, since the start or --resume, that were skipped for a loss or
+    gradient that is not finite."""
     learner: LearnerConfig = dataclasses.field(default_factory=LearnerConfig)
     """The update."""
     network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
@@ -206,6 +216,18 @@ class TrainConfig:
         return dataclasses.replace(
             self, data=absolute(self.data), word_vectors=absolute(self.word_vectors)
         )
+
+    def with_budget(self, other: TrainConfig) -> TrainConfig:
+        """The same run with the budget of another."""
+        return dataclasses.replace(self, **{name: getattr(other, name) for name in BUDGETS})
+
+    def spent(self, steps: int, episodes: int, seconds: float) -> float:
+        """The share of the budget that is spent after so much training; the run is over at 1."""
+        done = {"steps": steps, "episodes": episodes, "minutes": seconds / 60}
+        limits = {name: getattr(self, name) for name in BUDGETS}
+        if set(limits.values()) == {None}:
+            limits["steps"] = DEFAULT_STEPS
+        return max(done[name] / limit for name, limit in limits.items() if limit is not None)
 
     @property
     def steps_per_update(self) -> int:
@@ -285,10 +307,19 @@ def load(path: Path) -> TrainConfig:
     """Reads a run's `config.json`.
 
     Raises:
-      ValueError: the file is missing or unreadable; the message names it.
+      ValueError: the file is missing or unreadable, or names a model that is neither one of ours,
+        nor imported already, nor in `TDANET_TRUST`: making it would run its code. The message
+        names the file.
     """
     try:
-        return from_json(json.loads(path.read_text()))
+        config = from_json(json.loads(path.read_text()))
+        trusted = (*MODELS, *sys.modules, *os.environ.get(TRUST, "").split(","))
+        if config.model not in trusted:
+            raise ValueError(
+                f"its model is code of somebody's own, {config.model}; "
+                f"if you trust it, set {TRUST}={config.model}"
+            )
+        return config
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; is this the folder of a run?") from None
     except (json.JSONDecodeError, ValueError) as error:

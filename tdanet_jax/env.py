@@ -1,7 +1,7 @@
 """The environment: find an object of the target class in a room, as pure functions.
 
-`reset`, `step` and `observe` follow gymnax 1.0's calling convention and work on one episode; use
-`jax.vmap` for thousands. Scene tables are an argument (`EnvParams`), never a baked-in constant.
+`reset` and `step` follow gymnax 1.0's calling convention and work on one episode; use `jax.vmap`
+for thousands. Scene tables are an argument (`EnvParams`), never a baked-in constant.
 
 Axis letters: P positions, S = 16 P poses, C classes, G targets, K detections, Q (scene, target)
 pairs, R scenes.
@@ -101,11 +101,12 @@ def make_params(
     image: bool = False,
     similarity: np.ndarray | None = None,
     features: tuple[jax.Array, np.ndarray] | None = None,
+    scenes: Sequence[str] | None = None,
 ) -> EnvParams:
     """Puts scene tables into the arrays that the environment reads.
 
     Args:
-      tables: the rooms; only these are ever reset to.
+      tables: the rooms.
       targets: room type -> target classes that an episode may ask for.
       parents: parents of every target and their rewards.
       step_limits: actions after which an episode is truncated, by room type.
@@ -115,6 +116,7 @@ def make_params(
         for in place of parents.
       features: ResNet-18's maps of all poses of some rooms, [S', 49, 512], and for each position of
         these tables the row of its first pose there; observations then hold the map, too.
+      scenes: the rooms in which `reset` begins an episode; by default all.
 
     Raises:
       ValueError: no episode is possible.
@@ -123,6 +125,7 @@ def make_params(
     longest = max(int(np.diff(start).max(initial=0)), 1)
     pad = (0, longest)  # rows behind the last pose, so that a window of K never leaves the table
     position_room = tables.room_type[tables.position_scene]
+    pool = _episode_pool(tables, targets, tables.scenes if scenes is None else scenes)
     return EnvParams(
         next_position=jnp.asarray(tables.next_position, jnp.int32),
         position_room=jnp.asarray(position_room, jnp.int8),
@@ -140,7 +143,7 @@ def make_params(
         raster=jnp.asarray(tables.raster, jnp.int8) if image else None,
         features=None if features is None else features[0],
         first_feature=None if features is None else jnp.asarray(features[1], jnp.int32),
-        **{name: jnp.asarray(v, jnp.int32) for name, v in _episode_pool(tables, targets).items()},
+        **{name: jnp.asarray(v, jnp.int32) for name, v in pool.items()},
     )
 
 
@@ -170,14 +173,15 @@ def _detections(tables: SceneTables, merge: bool) -> tuple[np.ndarray, np.ndarra
 
 
 def _episode_pool(
-    tables: SceneTables, targets: Mapping[str, Sequence[str]]
+    tables: SceneTables, targets: Mapping[str, Sequence[str]], scenes: Sequence[str]
 ) -> dict[str, np.ndarray]:
-    """Nested lists, as flat arrays: room type -> scenes -> targets -> start positions.
+    """Nested lists, as flat arrays: room type -> `scenes` -> targets -> start positions.
 
     An episode is valid if its target is visible from a state that its start can reach; rooms and
     pairs without a valid episode are left out.
     """
     reachable = tables.distance.reshape(-1, POSES_PER_POSITION, len(tables.targets))[:, 0] >= 0
+    chosen = np.isin(np.array(tables.scenes), scenes)
     room_scenes = np.zeros((len(ROOM_TYPES), 2), np.int64)
     scene_pairs: list[tuple[int, int]] = []
     pair_target: list[int] = []
@@ -186,7 +190,7 @@ def _episode_pool(
     total = 0
     for room, room_name in enumerate(ROOM_TYPES):
         first_scene = len(scene_pairs)
-        for scene in np.flatnonzero(tables.room_type == room):
+        for scene in np.flatnonzero((tables.room_type == room) & chosen):
             first_pair = len(pair_target)
             positions = np.flatnonzero(tables.position_scene == scene)
             for name in targets.get(room_name, ()):

@@ -28,13 +28,17 @@ def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> No
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     episodes = [row["episodes"] for row in rows]
-    left.plot(episodes, [100 * row["success"] for row in rows], color=BLUE, label="SR")
-    left.plot(episodes, [100 * row["spl"] for row in rows], "--", color=ORANGE, label="SPL")
+
+    def column(name: str) -> np.ndarray:
+        return np.array([row[name] for row in rows], float)  # None becomes NaN: a gap
+
+    left.plot(episodes, 100 * column("success"), color=BLUE, label="SR")
+    left.plot(episodes, 100 * column("spl"), "--", color=ORANGE, label="SPL")
     left.set(ylabel="per cent, training rooms", ylim=(0, 100))
-    right.plot(episodes, [row["length"] for row in rows], color=GREEN, label="actions per episode")
+    right.plot(episodes, column("length"), color=GREEN, label="actions per episode")
     right.set(ylabel="actions per episode", ylim=(0, None))
     entropy = right.twinx()
-    entropy.plot(episodes, [row["entropy"] for row in rows], ":", color="0.3", label="entropy")
+    entropy.plot(episodes, column("entropy"), ":", color="0.3", label="entropy")
     entropy.set(ylabel="entropy of the policy (nats)", ylim=(0, None))
     # Above the axes, where no line runs.
     place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 2, "frameon": False}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +42,8 @@ class Task:
       classes: the vocabulary, and what of it training may know.
       model: the network.
       train_params: the training rooms, hidden classes filtered out.
-      eval_params: all rooms and classes, with the test step limits.
+      eval_params: all rooms and classes, with the test step limits; `reset` begins in the rooms of
+        the evaluation alone.
       train_words: [C, D], zero for hidden classes.
       words: [C, D], vectors of all classes.
       extras: what came with imported rooms; None with the bundled ones.
@@ -146,6 +148,7 @@ def make_task(
             TEST_STEP_LIMITS,
             *shown,
             features=_places(maps, trains | True),
+            scenes=split.eval_scenes,
         ),
         train_words=jnp.asarray(train_words),
         words=jnp.asarray(words),
@@ -189,6 +192,30 @@ def resolve_precision(config: NetworkConfig) -> NetworkConfig:
     has_amx = on_cpu and cpuinfo.exists() and "amx_bf16" in cpuinfo.read_text()
     fast = has_amx or not on_cpu
     return dataclasses.replace(config, precision="bfloat16" if fast else "float32")
+
+
+def without_effect(config: TrainConfig, classes: Classes) -> list[str]:
+    """The flags of the network that are set and change nothing for this model, if it is ours."""
+    network, default = config.network, NetworkConfig()
+    if config.model not in MODELS:
+        return []
+    model = make_model(config, classes)
+    other_precision = {"float32": "bfloat16", "bfloat16": "float32"}
+
+    def idle(name: str) -> bool:
+        if name == "rows":
+            return model.encoder.ROWS is not None
+        if name == "image":
+            return not model.encoder.IMAGE
+        value: Any = getattr(network, name)
+        other: Any = other_precision[value] if name == "precision" else getattr(default, name)
+        values: dict[str, Any] = {name: other}
+        changed = dataclasses.replace(network, **values)
+        return model == make_model(dataclasses.replace(config, network=changed), classes)
+
+    names = [field.name for field in dataclasses.fields(network) if field.name != "word_norm"]
+    chosen = [name for name in names if getattr(network, name) != getattr(default, name)]
+    return [f"--{name.replace('_', '-')}" for name in chosen if idle(name)]
 
 
 def make_model(config: TrainConfig, classes: Classes) -> ActorCritic:

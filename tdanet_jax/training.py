@@ -60,6 +60,7 @@ class Run:
         self.checkpoints = Checkpoints(folder)
         self._saved: int | None = None  # updates of the checkpoint that holds the present state
         self.state: TrainState = self._begin() if self.fresh else self._restore()
+        self._skipped_before = int(self.state.skipped)
 
     @property
     def fresh(self) -> bool:
@@ -108,17 +109,8 @@ class Run:
 
     @property
     def progress(self) -> float:
-        """Share of the budget that is spent; the run is over at 1.
-
-        The budget is `episodes` if given, else `steps`; `minutes` is a cap beside either.
-        """
-        config = self.config
-        spent = self.steps / config.steps
-        if config.episodes is not None:
-            spent = int(self.state.episodes) / config.episodes
-        if config.minutes is not None:
-            spent = max(spent, self.seconds / (60 * config.minutes))
-        return spent
+        """Share of the budget that is spent; the run is over at 1."""
+        return self.config.spent(self.steps, int(self.state.episodes), self.seconds)
 
     def chunks(self, until: int | None = None) -> Iterator[Row]:
         """Trains to the end of the budget; yields one row of metrics per chunk.
@@ -189,7 +181,7 @@ class Run:
         return row
 
     def _check_finite(self) -> None:
-        skipped = int(self.state.skipped)
+        skipped = int(self.state.skipped) - self._skipped_before
         if skipped >= self.config.max_skipped:
             self.save()
             raise ValueError(
@@ -227,20 +219,29 @@ class Run:
         return chunk.lower(self.state, share, self._words, self._params).compile()
 
     def _row(self, metrics: dict[str, np.ndarray], took: float) -> Row:
-        """One line of `metrics.jsonl`: means over the chunk's episodes and steps."""
+        """One line of `metrics.jsonl`: means over the chunk's episodes, updates and steps.
+
+        None where there is nothing to take a mean of: no episode ended, or no number was finite.
+        """
         steps = self.config.chunk_updates * self.config.steps_per_update
         episodes = int(metrics["episodes"].sum())
-        per_episode = 1 / max(episodes, 1)
-        mean = {k: float(metrics[k].mean()) for k in _UPDATE_MEANS}
+
+        def per_episode(name: str) -> float | None:
+            return float(metrics[name].sum()) / episodes if episodes else None
+
+        def over_updates(name: str) -> float | None:
+            finite = metrics[name][np.isfinite(metrics[name])]
+            return float(finite.mean()) if finite.size else None
+
         return {
             "updates": int(self.state.updates),
             "steps": self.steps,
             "episodes": int(self.state.episodes),
-            "success": float(metrics["success_sum"].sum()) * per_episode,
-            "spl": float(metrics["spl_sum"].sum()) * per_episode,
-            "length": float(metrics["length_sum"].sum()) * per_episode,
+            "success": per_episode("success_sum"),
+            "spl": per_episode("spl_sum"),
+            "length": per_episode("length_sum"),
             "reward": float(metrics["reward_sum"].sum()) / steps,
-            **mean,
+            **{name: over_updates(name) for name in _UPDATE_MEANS},
             "held_steps": int(metrics["held_steps"].sum()),
             "skipped": int(self.state.skipped),
             "seconds": round(self.seconds, 3),
@@ -287,7 +288,9 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
             run._check_finite()
 
 
-_UPDATE_MEANS = ("policy_loss", "value_loss", "entropy", "grad_norm")
+_UPDATE_MEANS = (
+    "policy_loss", "value_loss", "entropy", "explained_variance", "grad_norm", "learning_rate",
+)  # fmt: skip
 
 
 class Journal:
@@ -306,7 +309,7 @@ class Journal:
 
     def write(self, row: Row) -> None:
         """Appends a row, and those that waited; warns once per time that it cannot."""
-        self._waiting.append(json.dumps(row) + "\n")
+        self._waiting.append(json.dumps(row, allow_nan=False) + "\n")
         try:
             with self.path.open("ab") as file:
                 file.truncate(min(self._size, file.tell()))  # what an earlier attempt left

@@ -44,7 +44,7 @@ def sample(process: int, began: float) -> tuple[float, ...] | None:
 def train(minutes: float, folder: Path, arguments: list[str]) -> np.ndarray:
     """Trains for that long; samples [N, 4] taken while it did so."""
     command = [
-        sys.executable, "-m", "experiments.train_zero_shot", "--steps", str(10**9), "--minutes",
+        sys.executable, "-m", "experiments.train_zero_shot", "--minutes",
         str(minutes), "--checkpoint-minutes", "1", "--tensorboard", "--out", str(folder),
         *arguments,
     ]  # fmt: skip

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import sys
 
 import pytest
 
@@ -62,6 +63,42 @@ def test_an_unknown_field_is_refused(tmp_path):
     path.write_text(json.dumps(values))
     with pytest.raises(ValueError, match="wings"):
         configs.load(path)
+
+
+@pytest.mark.parametrize(
+    ("budget", "share"),
+    [
+        ({}, 6e6 / 12e6),
+        ({"steps": 8_000_000}, 6e6 / 8e6),
+        ({"episodes": 1000}, 0.3),
+        ({"minutes": 60.0}, 0.2),
+        ({"minutes": 60.0, "episodes": 1000}, 0.3),
+        ({"steps": 60_000_000, "minutes": 60.0, "episodes": 3000}, 0.2),
+    ],
+)
+def test_of_several_budgets_the_one_that_is_spent_first_counts(budget, share):
+    config = TrainConfig(**budget)
+    assert config.spent(6_000_000, 300, 12 * 60.0) == pytest.approx(share)
+
+
+def test_a_paper_run_ends_with_the_first_of_its_budgets():
+    assert dataclasses.replace(PAPER, steps=100).spent(100, 3, 1.0) == 1.0
+
+
+def test_a_run_of_a_model_of_ones_own_is_read_only_by_those_who_trust_it(tmp_path, monkeypatch):
+    path, config = tmp_path / "config.json", TrainConfig(model="some_lab.agent")
+    configs.save(config, path)
+    with pytest.raises(ValueError, match=r"set TDANET_TRUST=some_lab\.agent") as caught:
+        configs.load(path)
+    assert str(path) in str(caught.value)
+    monkeypatch.setenv(configs.TRUST, "another_lab.agent")
+    with pytest.raises(ValueError, match="code of somebody's own"):
+        configs.load(path)
+    monkeypatch.setenv(configs.TRUST, "another_lab.agent,some_lab.agent")
+    assert configs.load(path) == config
+    monkeypatch.delenv(configs.TRUST)
+    monkeypatch.setitem(sys.modules, "some_lab.agent", sys)
+    assert configs.load(path) == config
 
 
 def test_configs_are_frozen():

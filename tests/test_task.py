@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from tdanet_jax import env
+from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.scenes.offline import importer
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.task import make_task, resolve
+from tdanet_jax.task import make_task, resolve, without_effect
 from tdanet_jax.words import WordVectors
 
 SMALL = NetworkConfig(width=8, hidden=4, precision="float32")
@@ -79,3 +80,25 @@ def test_feature_maps_need_imported_rooms() -> None:
     network = dataclasses.replace(SMALL, image="features")
     with pytest.raises(ValueError, match="--image features: needs --data"):
         TrainConfig(network=network).check()
+
+
+@pytest.mark.parametrize(
+    ("model", "network", "idle"),
+    [
+        ("tdanet", NetworkConfig(), []),
+        ("tdanet", NetworkConfig(width=64, dropout=0.25, rows="class", precision="float32"), []),
+        ("tdanet", NetworkConfig(image="raster"), ["--image"]),
+        ("tdanet", NetworkConfig(inner_rate=1e-3), ["--inner-rate"]),
+        (
+            "ssnet",
+            NetworkConfig(width=64, dropout=0.25, rows="class"),
+            ["--width", "--dropout", "--rows"],
+        ),
+        ("baseline", NetworkConfig(dropout=0.25, image="raster", hidden=64), []),
+        ("savn", NetworkConfig(first_order=True, precision="bfloat16"), ["--precision"]),
+        ("my_lab.most_alike", NetworkConfig(image="raster"), []),
+    ],
+)
+def test_flags_that_change_nothing_are_named(model, network, idle) -> None:
+    config = TrainConfig(model=model, network=network)
+    assert sorted(without_effect(config, Classes())) == sorted(idle)

@@ -1,6 +1,7 @@
 """A run on disk: budget, metrics, checkpoints, and going on bit for bit after a stop."""
 
 import dataclasses
+import itertools
 import json
 import shutil
 
@@ -157,8 +158,31 @@ def test_a_run_that_is_no_longer_finite_stops_with_its_state_saved(task, tmp_pat
         list(run.chunks())
     assert "\n" not in str(caught.value)
     assert run.steps == 160  # two chunks of two updates, all skipped
-    assert Run(tmp_path, TINY, task).steps == 160
+    again = Run(tmp_path, dataclasses.replace(TINY, max_skipped=4, history=0), task)
+    assert again.steps == 160
+    row = next(again.chunks())  # it may skip as many again
+    assert (row["policy_loss"], row["entropy"], row["skipped"]) == (None, None, 6)
     assert not (tmp_path / "history").exists()  # none was asked for
+
+
+def test_a_chunk_in_which_no_episode_ended_has_no_success(task, tmp_path):
+    learning = dataclasses.replace(TINY.learner, num_envs=1, rollout_steps=1)
+    run = Run(tmp_path, dataclasses.replace(TINY, learner=learning, chunk_updates=1), task)
+    rows = list(itertools.islice(run.chunks(), 4))
+    pairs = itertools.pairwise(rows)
+    quiet = next(row for before, row in pairs if row["episodes"] == before["episodes"])
+    assert (quiet["success"], quiet["spl"], quiet["length"]) == (None, None, None)
+    assert read_metrics(tmp_path) == rows
+
+
+def test_a_finished_run_goes_on_with_a_larger_budget(whole, task, tmp_path):
+    folder = shutil.copytree(whole[0], tmp_path / "longer")
+    longer = Run(folder, TINY.with_budget(TrainConfig(steps=960)), task)
+    assert longer.progress == pytest.approx(640 / 960)
+    rows = list(longer.chunks())
+    assert longer.steps == 960
+    assert [row["steps"] for row in read_metrics(folder)] == list(range(80, 961, 80))
+    assert rows[-1]["learning_rate"] < rows[0]["learning_rate"]
 
 
 # A read that fails half-way leaves Orbax's own tasks behind, which complain when collected.

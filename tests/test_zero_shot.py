@@ -304,6 +304,21 @@ def test_evaluation_sees_hidden_classes(rooms: SceneTables, glove: WordVectors) 
             assert np.asarray(task.words)[index].any()
 
 
+def test_episodes_of_the_evaluation_begin_in_its_rooms(
+    rooms: SceneTables, glove: WordVectors
+) -> None:
+    task = make_task(config_of("18/4", False), rooms, glove)
+    positions = {}
+    for name in ("train_params", "eval_params"):
+        params = getattr(task, name)
+        positions[name] = np.unique(np.asarray(params.start_position))
+    scenes = np.array(rooms.scenes)[rooms.position_scene[positions["eval_params"]]]
+    assert set(scenes) == set(task.split.eval_scenes)
+    trained = rooms.subset(task.split.train_scenes)
+    scenes = np.array(trained.scenes)[trained.position_scene[positions["train_params"]]]
+    assert set(scenes) == set(task.split.train_scenes)
+
+
 def test_hide_classes_leaves_no_trace_and_everything_else(rooms: SceneTables) -> None:
     hidden = {"Toaster", "Laptop", "Mug"}
     noisy = dataclasses.replace(

@@ -1,8 +1,9 @@
 """The interface that every model meets: detections and a target class in, features out.
 
-A model is one file in this folder. It defines an `Encoder` and a function
-`make(config, classes, dtype) -> ActorCritic`, and gets its name in `tdanet_jax.config.MODELS`. The
-environment, the update, the evaluation and every command then work with it.
+A model is one file, here or anywhere that Python finds it. It defines an `Encoder` and a function
+`make(config, classes, dtype) -> ActorCritic`. `--model` takes its dotted name; those in this folder
+have short ones, in `tdanet_jax.config.MODELS`. The environment, the update, the evaluation and
+every command then work with it.
 """
 
 from __future__ import annotations

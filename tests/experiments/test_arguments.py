@@ -47,7 +47,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--out full/file/below", "full/file/below: Not a directory"),
         ("--resume nowhere", "nowhere/config.json: no such file; is this the folder of a run?"),
         ("--devices 0", "--devices 0: must be positive"),
-        ("--resume nowhere --steps 5", "--resume goes on to the original budget: beside it, --dev"),
+        ("--resume nowhere --seed 5", "--resume goes on as the run began: beside it, a new budget"),
         ("--resume full/file", "full/file/config.json: Not a directory"),
         ("--resume broken", "broken/config.json: Expecting property name"),
         ("--resume binary", "binary/config.json: 'utf-8' codec can't decode"),

@@ -38,6 +38,9 @@ def test_the_example_on_the_page_is_a_model(
     results = json.loads((out / "results.json").read_text())
     assert results["unseen"]["L>=1"]["n"] == 1000
     monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=r"set TDANET_TRUST=my_lab\.most_alike"):
+        tdanet_jax.load(out)
+    monkeypatch.setenv("TDANET_TRUST", "my_lab.least_alike,my_lab.most_alike")
     agent = tdanet_jax.load(out)
     seen = [Detection("sink", 0.5, 0.6, 0.9, 0.9), Detection("toaster", 0.1, 0.4, 0.3, 0.7)]
     _, decision = agent.act(agent.start(), seen, target="toaster")
