@@ -149,13 +149,7 @@ def _checked(network: Saved, task: Task) -> Snapshot:
             f"{network.point or network.run}: trained on scene tables {snapshot.data_version}, "
             f"these are {task.tables.data_version}"
         )
-    names = classes.load(network.run).names
-    numbered = task.model.encoder.ROWS == "class" or task.model.encoder.IMAGE
-    if numbered and names and names != task.tables.classes:
-        raise ValueError(
-            f"--data {network.config.data}: {network.config.model} knows the classes of "
-            f"{network.run} alone, in number"
-        )
+    task.check_known(network.run, classes.load(network.run).names)
     return snapshot
 
 

@@ -25,7 +25,7 @@ from tdanet_jax.reward import (
     no_parents,
     published_parents,
 )
-from tdanet_jax.scenes.dataset import Extras, load_rooms
+from tdanet_jax.scenes.dataset import Extras, Rooms, load_rooms
 from tdanet_jax.scenes.offline import importer
 from tdanet_jax.scenes.tables import Progress, SceneTables
 from tdanet_jax.vocabulary import ROOM_TYPES, Split, make_split
@@ -67,6 +67,20 @@ class Task:
         maps = "ResNet-18's feature map of the frame"
         return maps if self.model.encoder.maps else "the class in each of 7 x 7 cells of the frame"
 
+    def check_known(self, run: Path | str, names: tuple[str, ...]) -> None:
+        """Raises ValueError if the model knows classes by number, and by that of other classes.
+
+        Args:
+          run: what to call the model.
+          names: the classes of its training rooms; empty if nobody knows.
+        """
+        numbered = self.model.encoder.ROWS == "class" or self.model.encoder.IMAGE
+        if numbered and names and names != self.tables.classes:
+            raise ValueError(
+                f"{run}: the model knows classes by their number in the rooms of its training, "
+                "and these rooms have others"
+            )
+
 
 def load_task(config: TrainConfig, progress: Progress | None = None) -> Task:
     """The task of a configuration on the rooms and with the word vectors that it names.
@@ -77,17 +91,26 @@ def load_task(config: TrainConfig, progress: Progress | None = None) -> Task:
     Raises:
       ValueError: a file is broken, or does not hold what the split needs; names the file.
     """
-    rooms = load_rooms(config.data, progress)
+    return task_in(load_rooms(config.data, progress), config)
+
+
+def task_in(rooms: Rooms, config: TrainConfig) -> Task:
+    """The task of a configuration in these rooms, whichever rooms it names itself.
+
+    Raises:
+      ValueError: a file is broken, or the rooms do not hold what the split or the model needs.
+    """
     vectors = word_vectors.load(config.word_vectors, rooms.tables.classes)
-    config, features = resolve(config), None
-    if config.data is not None and config.network.image == "features":
-        features = importer.load_features(Path(config.data), rooms.tables)
+    data = None if rooms.path is None else str(rooms.path)
+    config, features = resolve(dataclasses.replace(config, data=data)), None
+    if rooms.path is not None and config.network.image == "features":
+        features = importer.load_features(rooms.path, rooms.tables)
     try:
         return make_task(config, rooms.tables, vectors, rooms.extras, features)
     except ValueError as error:
-        if config.data is None:
+        if rooms.path is None:
             raise
-        raise ValueError(f"{config.data}: {error}") from None
+        raise ValueError(f"{rooms.path}: {error}") from None
 
 
 def make_task(
@@ -109,7 +132,8 @@ def make_task(
         Pictures show hidden classes, too: nothing can be filtered out of them.
 
     Raises:
-      ValueError: the rooms hold none to train or to evaluate in, or a class has no word vector.
+      ValueError: the rooms hold none to train or to evaluate in, a class has no word vector, or
+        the model looks at feature maps and there are none.
     """
     split = make_split(config.split, config.validation).within(tables.scenes, tables.classes)
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
@@ -118,6 +142,8 @@ def make_task(
         adjacency = graph.co_occurrence(seen_rooms)
     classes = make_classes(tables.classes, split.hidden, adjacency)
     model = make_model(config, classes)
+    if model.encoder.maps and features is None:
+        raise ValueError(f"{config.model} looks at feature maps, and these rooms have none")
     shown = (model.encoder.ROWS or config.network.rows) == "class", model.encoder.IMAGE
     maps = _feature_maps(features) if features is not None and model.encoder.maps else None
     trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]

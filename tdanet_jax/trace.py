@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from tdanet_jax import agent, attention, env, evaluation, policies
-from tdanet_jax import words as word_vectors
 from tdanet_jax.env import EnvParams
 from tdanet_jax.episodes import Episodes
 from tdanet_jax.evaluation import Records
@@ -26,7 +25,7 @@ from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.policies import Policy
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.task import Task, make_task
+from tdanet_jax.task import Task, task_in
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action
 
 
@@ -72,17 +71,13 @@ def load_player(run: Path | str, rooms: Rooms, greedy: bool = False) -> Player:
       A player with the name of the run's folder, or of the point.
 
     Raises:
-      ValueError: the folder holds no run, its checkpoint cannot be read, or the network knows
-        classes by number and the rooms have others.
+      ValueError: the folder holds no run, its checkpoint cannot be read, the network looks at
+        feature maps that the rooms do not have, or it knows classes by number and the rooms have
+        others.
     """
     config, weights, classes = agent.read(run)
-    tables = rooms.tables
-    vectors = word_vectors.load(config.word_vectors, tables.classes)
-    task = make_task(config, tables, vectors, rooms.extras)
-    encoder = task.model.encoder
-    numbered = encoder.ROWS == "class" or encoder.IMAGE
-    if numbered and classes.names and classes.names != tables.classes:
-        raise ValueError(f"{run}: {config.model} knows the classes of its own rooms alone")
+    task = task_in(rooms, config)
+    task.check_known(run, classes.names)
     return Player(Path(run).resolve().name, task, task.model, weights, greedy)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -113,12 +114,16 @@ def opinionated_run(
 
 
 def save_untrained(
-    config: TrainConfig, folder: Path, tables: SceneTables, vectors: WordVectors
+    config: TrainConfig,
+    folder: Path,
+    tables: SceneTables,
+    vectors: WordVectors,
+    features: np.ndarray | None = None,
 ) -> tuple[Task, Any]:
     """Makes a run's folder with one checkpoint: drawn parameters, an actor with opinions."""
     folder.mkdir()
     (folder / CONFIG_FILE).write_text(json.dumps(configs.to_json(config)))
-    task = make_task(config, tables, vectors)
+    task = make_task(config, tables, vectors, features=features)
     task.classes.save(folder)
     weights = samples.parameters(task.model, task.words)
     weights["actor"]["bias"] = weights["actor"]["bias"].at[Action.DONE].set(-1.0)

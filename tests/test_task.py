@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 
 import jax
@@ -57,6 +58,27 @@ def test_each_pose_has_its_own_feature_map_in_training_and_in_tests(
         expected = (16 * position[:, None] + np.arange(16)).reshape(-1) % 2048
         np.testing.assert_array_equal(seen[:, :, 0], np.repeat(expected[:, None], 49, 1))
         np.testing.assert_array_equal(seen[0, :, 1], np.arange(49))
+
+
+def test_a_model_of_feature_maps_needs_them(ithor: SceneTables, glove: WordVectors) -> None:
+    config = TrainConfig(model="baseline", network=dataclasses.replace(SMALL, image="features"))
+    with pytest.raises(ValueError, match="baseline looks at feature maps, and these rooms have no"):
+        make_task(config, rooms(ithor), glove)
+
+
+def test_a_model_that_numbers_classes_is_kept_from_others(
+    ithor: SceneTables, glove: WordVectors
+) -> None:
+    tables = rooms(ithor)
+    for model, numbered in (("ssnet", True), ("baseline", True), ("tdanet", False)):
+        network = dataclasses.replace(SMALL, image="raster")
+        task = make_task(TrainConfig(model=model, network=network), tables, glove)
+        task.check_known("runs/a", tables.classes)
+        task.check_known("runs/a", ())
+        with contextlib.nullcontext() if not numbered else pytest.raises(
+            ValueError, match="runs/a: the model knows classes by their number"
+        ):
+            task.check_known("runs/a", tables.classes[1:])
 
 
 def test_models_without_an_image_are_shown_none(ithor: SceneTables, glove: WordVectors) -> None:

@@ -66,10 +66,16 @@ class Extras:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rooms:
-    """Tables and what came beside them; nothing does beside the bundled ones."""
+    """Tables and what came beside them; nothing does beside the bundled ones.
+
+    Attributes:
+      path: the file that they were read from, beside which their feature maps lie; None if there
+        is none.
+    """
 
     tables: SceneTables
     extras: Extras | None
+    path: Path | None = None
 
 
 def load_rooms(path: str | Path | None, progress: Progress | None = None) -> Rooms:
@@ -110,7 +116,7 @@ def load(path: Path) -> Rooms:
         problem = find_problem(tables)
         if problem is not None:
             raise FileError(path, f"not a file of rooms ({problem})")
-        return Rooms(with_known_targets(tables), _read_extras(arrays))
+        return Rooms(with_known_targets(tables), _read_extras(arrays), path)
     except FileError:
         raise
     except Exception as error:  # a missing array, a field of another kind, broken JSON

@@ -13,7 +13,9 @@ import pytest
 
 from experiments import attention, replay, trajectories
 from tdanet_jax import episodes
-from tests import browser
+from tdanet_jax.scenes import dataset
+from tdanet_jax.scenes.offline import importer
+from tests import browser, original
 from tests.conftest import TINY, save_untrained
 
 
@@ -131,6 +133,39 @@ def test_a_model_that_sees_an_image_and_adapts_stands_beside_another(
     with pytest.raises(SystemExit):
         attention.main(["--checkpoint", str(run), *chosen, "--data", str(rooms_file)])
     assert f"{run}: this model has no attention" in capsys.readouterr().err
+
+
+def test_a_model_that_was_trained_on_feature_maps_sees_those_of_the_rooms(
+    tmp_path, monkeypatch, capsys, rooms_file, glove
+):
+    """Of the rooms that it is shown in, be they its own or others."""
+    monkeypatch.setenv("TDANET_CACHE", str(tmp_path / "cache"))
+    rooms = importer.read_folder(original.write_all(tmp_path / "original"), lambda *_: None)
+    maps = np.random.default_rng(0).normal(size=(rooms.tables.num_states, 512, 7, 7))
+    for name, share in (("own", 1.0), ("other", 3.0)):
+        dataset.save(rooms, tmp_path / f"{name}.npz")
+        np.save(tmp_path / f"{name}.features.npy", (share * maps).astype(np.float16))
+    network = dataclasses.replace(TINY.network, image="features")
+    config = dataclasses.replace(
+        TINY, model="baseline", network=network, data=str(tmp_path / "own.npz")
+    )
+    run = tmp_path / "run"
+    save_untrained(config, run, rooms.tables, glove, maps)
+    chosen = ["--scene", "FloorPlan21", "--target", "Mug", "--start", "0", "0", "180"]
+    values = []
+    for rooms_of in ("own", "own", "other"):
+        out, given = tmp_path / "page.html", ["--data", str(tmp_path / f"{rooms_of}.npz")]
+        replay.main(
+            ["--checkpoint", str(run), *chosen, "--out", str(out)]
+            + (given if rooms_of == "other" else [])
+        )
+        text = re.search(r'type="application/json">(.*?)</script>', out.read_text(), re.S).group(1)
+        values.append(json.loads(text)["players"][0]["steps"][0]["value"])
+    assert values[0] == values[1] != values[2]
+    elsewhere = ["--data", str(rooms_file), "--scene", "FloorPlan229", "--target", "Painting"]
+    with pytest.raises(SystemExit):
+        trajectories.main(["--checkpoint", str(run), *elsewhere])
+    assert "features.npy: no such file; import with --features" in capsys.readouterr().err
 
 
 def test_the_page_of_a_real_room_as_a_user_asks_for_it(opinionated_run, tmp_path):
