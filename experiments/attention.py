@@ -50,8 +50,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 def show(command: Command) -> None:
     """Plays, and writes the tables and pictures."""
-    from tdanet_jax import files, pictures
+    from tdanet_jax import devices, files, pictures
 
+    devices.keep_compiled()
     choice, out = (
         command.choice,
         command.out or one_episode.folder_of(command.checkpoint) / "attention",

@@ -98,6 +98,31 @@ def check_empty(folder: Path, instead: str = "") -> None:
         fail(f"--out {folder}: exists and is not empty{instead}")
 
 
+def check_new_file(path: Path, in_folder: bool = True) -> None:
+    """Fails if there is something at the path of --out or, with `in_folder`, no folder to hold it.
+
+    Data are never overwritten; pictures and pages, which are drawn anew at will, are.
+    """
+    if path.exists():
+        fail(f"--out {path}: exists")
+    if in_folder and not path.absolute().parent.is_dir():
+        fail(f"--out {path}: no such folder")
+
+
+def check_picture(out: Path) -> None:
+    """Fails unless --out ends in a format that pictures can be written in."""
+    from tdanet_jax import pictures
+
+    if out.suffix[1:] not in pictures.formats():
+        fail(f"--out {out}: end it in one of .{', .'.join(pictures.formats())}")
+
+
+def check_at_most(flag: str, value: int, most: int) -> None:
+    """Fails if a flag's value is above what there is."""
+    if value > most:
+        fail(f"--{flag} {value}: at most {most}")
+
+
 def check_positive(**flags: int | Sequence[int]) -> None:
     """Fails if a flag's value, or one of its values, is below 1."""
     for name, given in flags.items():

@@ -82,11 +82,12 @@ def main(arguments: list[str] | None = None) -> None:
         untrained_config(command).check()
         folder = command.out or default_folder(command)
         check_empty(folder)
+        from tdanet_jax import devices, saved
+
+        devices.keep_compiled()
         if not trained:
             evaluate_untrained(command, folder)
             return
-        from tdanet_jax import saved
-
         networks = [
             n for run in command.checkpoint for n in saved.find(run, command.history, command.data)
         ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -55,6 +56,13 @@ def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
     """
     if not runs:
         fail("give --checkpoint, the folder of a run")
+    configs.check_seed(choice.seed)
+    if choice.start is not None:
+        start = f"--start {' '.join(map(str, choice.start))}"
+        if not all(map(math.isfinite, choice.start)):
+            fail(f"{start}: must be finite")
+        if choice.start[2] % 45:
+            fail(f"{start}: rotation {choice.start[2]}: not a multiple of 45 degrees")
     for run in runs:
         configs.load(folder_of(run) / CONFIG_FILE)
     if choice.episode is not None:

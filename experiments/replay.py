@@ -41,8 +41,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 def write(command: Command) -> None:
     """Plays the episode and writes the page."""
-    from tdanet_jax import files, replay
+    from tdanet_jax import devices, files, replay
 
+    devices.keep_compiled()
     choice, runs = command.choice, command.checkpoint
     rooms = one_episode.load_rooms(choice, runs)
     traces = one_episode.play_runs(choice, runs, rooms, command.shortest)

@@ -13,6 +13,7 @@ import dataclasses
 import importlib
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,6 +22,9 @@ import numpy as np
 import tyro
 
 from experiments.console import (
+    check_at_most,
+    check_new_file,
+    check_picture,
     check_positive,
     console,
     fail,
@@ -29,14 +33,11 @@ from experiments.console import (
     reporter,
 )
 from tdanet_jax.scenes.scene import GRID
-from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TRAIN_SCENES_PER_TYPE
+from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TRAIN_SCENES_PER_TYPE, make_split
 
 if TYPE_CHECKING:
     from tdanet_jax.scenes import SceneTables, dataset
     from tdanet_jax.scenes.scene import Scene
-
-
-PICTURES = (".png", ".svg", ".pdf")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,9 +72,12 @@ class Verify:
         """Prints the tables."""
         check_positive(rooms=self.rooms, views=self.views, worst=self.worst)
         from tdanet_jax.scenes import ithor
+        from tdanet_jax.scenes.geometry import VIEWS
 
         start = time.monotonic()
         rooms = ithor.load_scenes()
+        check_at_most("rooms", self.rooms, len(rooms))
+        check_at_most("views", self.views, min(len(room.points) for room in rooms) * VIEWS)
         train = [room for i, room in enumerate(rooms) if _trains(i)]
         test = [room for i, room in enumerate(rooms) if not _trains(i)]
         for line in flag_lines(train, test, self.worst):
@@ -189,14 +193,13 @@ class Inspect:
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
     out: Path = Path("scene.png")
-    """Picture to write."""
+    """Picture to write; an older one is replaced."""
 
     def run(self) -> None:
         """Writes the picture and lists the view."""
         from tdanet_jax.scenes import picture
 
-        if self.out.suffix not in PICTURES:
-            fail(f"--out {self.out}: must end in {', '.join(PICTURES)}")
+        check_picture(self.out)
         if self.position is None and (self.rotation or self.horizon):
             fail("--rotation and --horizon need --position")
         if self.position is not None and not all(map(math.isfinite, self.position)):
@@ -205,7 +208,7 @@ class Inspect:
         if self.position is None:
             state = picture.most_telling_state(tables)
         else:
-            state = picture.nearest_state(tables, *self.position, self.rotation, self.horizon)
+            state = tables.nearest_state(0, *self.position, self.rotation, self.horizon)
         picture.draw(room, tables, state, self.out)
         console.print(f"{self.out}")
 
@@ -228,8 +231,10 @@ class Inspect:
         return room, scene_tables.build([room])
 
     def _check(self, names: Sequence[str]) -> None:
+        from tdanet_jax.episode_lookup import name_ranges
+
         if self.scene not in names:
-            fail(f"{self.scene}: no such room; there are {names[0]} to {names[-1]}")
+            fail(f"{self.scene}: no such room; there are {name_ranges(names)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -253,30 +258,31 @@ class Import:
 
     def run(self) -> None:
         """Writes the file and says what in the rooms is out of reach."""
-        from tdanet_jax.scenes import dataset
         from tdanet_jax.scenes.offline import importer
 
-        beside = importer.features_path(self.out)
         if (self.scenes is None) == (self.source is None):
             fail("import needs a scene file, or --from a folder of FloorPlan*, and not both")
         if self.features and self.source is None:
             fail("--features: needs --from")
-        for path in (self.out, beside) if self.features else (self.out,):
-            if path.exists():
-                fail(f"--out {path}: exists")
-        if not self.out.absolute().parent.is_dir():
-            fail(f"--out {self.out}: no such folder")
-        rooms = dataset.Rooms(_rebuilt(self.scenes), None) if self.scenes else self._imported()
-        print_survey(rooms.tables)
+        check_new_file(self.out)
+        maps = None
         if self.features and self.source is not None:
+            check_new_file(importer.features_path(self.out))
+            maps = importer.find_features(self.source)
+        rooms = _rebuilt(self.scenes) if self.scenes is not None else self._imported()
+        print_survey(rooms.tables)
+        print_needs(rooms)
+        if maps is None:
+            importer.save(rooms, self.out)
+        else:
             with reporter("feature maps") as report:
-                importer.write_features(self.source, rooms.tables, beside, report)
-            console.print(f"{beside}")
-        dataset.save(rooms, self.out)
-        console.print(f"{self.out}")
+                importer.save(rooms, self.out, maps, report)
+        if self.source is not None:
+            importer.forget(self.source)
+        for path in (importer.features_path(self.out), self.out) if maps else (self.out,):
+            console.print(f"{path}")
 
     def _imported(self) -> dataset.Rooms:
-        from tdanet_jax import words
         from tdanet_jax.scenes.offline import importer
 
         assert self.source is not None
@@ -288,26 +294,49 @@ class Import:
                     line = ""
                 report(share, line)
 
-            rooms = importer.read_folder(self.source, say)
-        if not (rooms.tables.row_box >= 0).any():
-            console.print("No boxes in any room: an agent that sees detections will see nothing.")
-        lacking = words.load_bundled().missing(rooms.tables.classes)
-        if lacking:
-            console.print(f"Needs --word-vectors: no bundled ones for {', '.join(lacking)}")
-        return rooms
+            return importer.read_folder(self.source, say)
 
 
-def _rebuilt(path: Path) -> SceneTables:
-    """The tables of a scene file."""
-    from tdanet_jax.scenes import metadata
+def _rebuilt(path: Path) -> dataset.Rooms:
+    """The rooms of a scene file."""
+    from tdanet_jax.scenes import SceneError, dataset, metadata
     from tdanet_jax.scenes import tables as scene_tables
 
     rooms = metadata.read_scenes(path)
-    metadata.check_classes(rooms)
     with reporter("rooms") as report:
-        return scene_tables.build(
-            rooms, progress=lambda done, total: report(done / total, "rebuilt")
+        try:
+            tables = scene_tables.build(
+                rooms, progress=lambda done, total: report(done / total, "rebuilt")
+            )
+        except SceneError as error:
+            raise SceneError(f"{path}: {error}") from None
+    parts = {room.name: room.part for room in rooms if room.part is not None}
+    return dataset.Rooms(tables, dataset.Extras(parts=parts))
+
+
+def print_needs(rooms: dataset.Rooms) -> None:
+    """Prints for what imported rooms serve and what else they need, and warns of useless ones."""
+    from tdanet_jax import words
+    from tdanet_jax.scenes import dataset
+
+    tables = rooms.tables
+    split = dataset.with_own_rooms(make_split("22/0"), rooms)
+    train = [name for name in tables.scenes if name in split.train_scenes]
+    test = [name for name in tables.scenes if name in split.eval_scenes]
+    console.print(f"Rooms to train in: {len(train)}; to be evaluated in: {len(test)}")
+    unused = [name for name in tables.scenes if name not in {*train, *test}]
+    if unused or not train or not test:
+        named = f"no split uses {', '.join(unused)}; " if unused else ""
+        warnings.warn(
+            f"{named}a run needs a room to train in and one to be evaluated in: by the names of "
+            'iTHOR\'s rooms, or by "split": "train" or "test" in the scene file',
+            stacklevel=2,
         )
+    if not (tables.row_box >= 0).any():
+        console.print("No boxes in any room: an agent that sees detections will see nothing.")
+    lacking = words.load_bundled().missing(tables.classes)
+    if lacking:
+        console.print(f"Needs --word-vectors: no bundled ones for {', '.join(lacking)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -334,8 +363,9 @@ class Export:
         from tdanet_jax.scenes import dataset
         from tdanet_jax.scenes.offline import exporter
 
-        if self.out.exists():
-            fail(f"--out {self.out}: exists")
+        if self.word_vectors is not None and not self.vectors:
+            fail(f"--word-vectors {self.word_vectors}: only with --vectors")
+        check_new_file(self.out, in_folder=False)
         with reporter("rooms", transient=True) as rebuilt:
             rooms = dataset.load_rooms(self.data, lambda n, total: rebuilt(n / total, "rebuilt"))
         tables, extras = rooms.tables, rooms.extras
@@ -357,12 +387,13 @@ class Collect:
     scenes: tyro.conf.Positional[tuple[str, ...]]
     """Rooms as NAME=TYPE, say FloorPlan1=kitchen."""
     out: Path = Path("scenes.json")
-    """Scene file to write."""
+    """Scene file to write; must not exist."""
 
     def run(self) -> None:
         """Starts AI2-THOR, visits the rooms, writes the file."""
         from tdanet_jax.scenes import collect
 
+        check_new_file(self.out)
         if not self.scenes:
             fail("collect: name a room, say FloorPlan1=kitchen")
         rooms = []

@@ -93,7 +93,7 @@ def main(arguments: list[str] | None = None) -> None:
                 check_new(folder)
         check_positive(devices=command.devices)
         if command.tensorboard and importlib.util.find_spec("tensorboardX") is None:
-            fail("--tensorboard needs tensorboardX: pip install 'tdanet-jax[tensorboard]'")
+            fail("--tensorboard needs tensorboardX: pip install tensorboardX")
         train(config, folder, command)
 
 

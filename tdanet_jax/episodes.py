@@ -133,10 +133,10 @@ def published(
                 continue
             if episode.target not in targets.get(ROOM_TYPES[tables.room_type[scene]], ()):
                 continue
-            here = np.flatnonzero(tables.position_scene == scene)
-            gaps = np.abs(tables.position[here][:, [0, 2]] - (episode.x, episode.z)).max(axis=1)
-            pose = (here[gaps.argmin()] * ROTATIONS + episode.rotation // 45) * 2
-            pose, goal = pose + episode.horizon // 30, tables.targets.index(episode.target)
+            goal = tables.targets.index(episode.target)
+            pose = tables.nearest_state(
+                scene, episode.x, episode.z, episode.rotation, episode.horizon
+            )
             if tables.distance[pose, goal] >= 0:
                 poses.append(pose)
                 goals.append(goal)

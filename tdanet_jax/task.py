@@ -25,7 +25,7 @@ from tdanet_jax.reward import (
     no_parents,
     published_parents,
 )
-from tdanet_jax.scenes.dataset import Extras, Rooms, load_rooms
+from tdanet_jax.scenes.dataset import Extras, Rooms, load_rooms, with_own_rooms
 from tdanet_jax.scenes.offline import importer
 from tdanet_jax.scenes.tables import Progress, SceneTables
 from tdanet_jax.vocabulary import ROOM_TYPES, Split, make_split
@@ -135,7 +135,9 @@ def make_task(
       ValueError: the rooms hold none to train or to evaluate in, a class has no word vector, or
         the model looks at feature maps and there are none.
     """
-    split = make_split(config.split, config.validation).within(tables.scenes, tables.classes)
+    split = make_split(config.split, config.validation)
+    split = with_own_rooms(split, Rooms(tables, extras), config.validation)
+    split = split.within(tables.scenes, tables.classes)
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
     adjacency = None if extras is None else extras.class_graph(tables.classes)
     if adjacency is None:

@@ -39,6 +39,9 @@ TRAIN_SCENES_PER_TYPE = 20
 #: `--validation` trains on the first 16 training rooms of a type and evaluates on the last 4.
 VALIDATION_TRAIN_SCENES_PER_TYPE = 16
 
+#: What rooms are for.
+PARTS = ("train", "test")
+
 #: The 22 target classes by room type.
 TARGETS: dict[str, tuple[str, ...]] = {
     "kitchen": ("Toaster", "Spatula", "Bread", "Mug", "CoffeeMachine", "Apple"),
@@ -100,14 +103,11 @@ class Split:
         """
         train = tuple(name for name in self.train_scenes if name in scenes)
         evaluated = tuple(name for name in self.eval_scenes if name in scenes)
-        for title, wanted, left in (
-            ("training", self.train_scenes, train),
-            ("evaluation", self.eval_scenes, evaluated),
-        ):
+        for title, left in (("training", train), ("evaluation", evaluated)):
             if not left:
                 raise ValueError(
-                    f"none of the {title} rooms of split {self.name}, "
-                    f"{wanted[0]} to {wanted[-1]}, is among the {len(scenes)} rooms"
+                    f"none of the {title} rooms of split {self.name} (by iTHOR's names, or by "
+                    f'"split" in a scene file) is among the {len(scenes)} rooms'
                 )
 
         def present(targets: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:

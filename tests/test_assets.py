@@ -1,11 +1,17 @@
 """Bundled files are found and checked."""
 
+import contextlib
+import json
+import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tdanet_jax import assets, bundle
+from tdanet_jax import assets, bundle, episodes, words
 from tdanet_jax.assets import AssetError
+from tdanet_jax.scenes import ithor
+from tests import toy
 
 
 @pytest.fixture
@@ -68,6 +74,56 @@ def test_the_notice_names_every_source() -> None:
             assert part in text
     assert "Permission is hereby granted" in text  # the MIT licence asks for its own text
     assert "Apache License" in text
+
+
+def test_nothing_but_a_wheel_is_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """pip runs what a source package says to build it."""
+    asked: list[list[str]] = []
+
+    def run(command: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
+        asked.append(command)
+        return subprocess.CompletedProcess(command, 1, "", "ERROR: no network")
+
+    monkeypatch.setattr(bundle.subprocess, "run", run)
+    with pytest.raises(AssetError, match=r"procthor==.*: download failed: ERROR: no network"):
+        bundle.fetch(bundle.PROCTHOR, tmp_path)
+    assert "--only-binary=:all:" in asked[0]
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_bundled_files_are_replaced_when_all_new_ones_are_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    def make(name: str) -> Any:
+        def write(*given: Any) -> Path:
+            folder = given[-2] if name == words.ASSET else given[-1]
+            if fails and name == words.ASSET:
+                raise KeyboardInterrupt
+            (folder / name).write_text("new")
+            return folder / name
+
+        return write
+
+    monkeypatch.setattr(bundle, "fetch", lambda source, folder: folder / source.wheel)
+    monkeypatch.setattr(bundle, "notice_text", lambda wheels: "new")
+    for module in (ithor, words, episodes):
+        monkeypatch.setattr(module, "build_asset", make(module.ASSET))
+    monkeypatch.setattr(ithor, "load_scenes", lambda path: [toy.corridor()])
+    out = tmp_path / "assets"
+    out.mkdir()
+    for name in (ithor.ASSET, words.ASSET, "of the user"):
+        (out / name).write_text("old")
+    with pytest.raises(KeyboardInterrupt) if fails else contextlib.nullcontext():
+        made = bundle.build(out)
+    content = {path.name: path.read_text() for path in out.iterdir()}
+    if fails:
+        assert content == dict.fromkeys((ithor.ASSET, words.ASSET, "of the user"), "old")
+    else:
+        assert content.pop("of the user") == "old"
+        assert {path.name for path in made} == content.keys()
+        assert set(json.loads(content.pop(assets.CHECKSUMS))) == content.keys()
+        assert set(content.values()) == {"new"}
+    assert [path.name for path in tmp_path.iterdir()] == ["assets"]
 
 
 def test_a_wheel_with_other_content_is_refused(tmp_path: Path) -> None:

@@ -18,10 +18,10 @@ from scipy import stats
 from tdanet_jax import env
 from tdanet_jax.env import EnvParams, EnvState, Observation
 from tdanet_jax.reward import Parents, cosines, greatest_similarity, no_parents
-from tdanet_jax.scenes import SceneTables, toy
+from tdanet_jax.scenes import SceneTables
 from tdanet_jax.scenes.tables import build
 from tdanet_jax.vocabulary import TARGETS
-from tests import handmade, oracle
+from tests import handmade, oracle, toy
 from tests.handmade import Room, Sighting, corridor, lopsided, random_tables, tables_of
 from tests.oracle import DONE, ROOMS, Detection, Episode, World, pose_of, state_of
 

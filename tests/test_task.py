@@ -75,8 +75,10 @@ def test_a_model_that_numbers_classes_is_kept_from_others(
         task = make_task(TrainConfig(model=model, network=network), tables, glove)
         task.check_known("runs/a", tables.classes)
         task.check_known("runs/a", ())
-        with contextlib.nullcontext() if not numbered else pytest.raises(
-            ValueError, match="runs/a: the model knows classes by their number"
+        with (
+            contextlib.nullcontext()
+            if not numbered
+            else pytest.raises(ValueError, match="runs/a: the model knows classes by their number")
         ):
             task.check_known("runs/a", tables.classes[1:])
 

@@ -137,5 +137,5 @@ def test_a_split_within_fewer_rooms_and_classes() -> None:
     assert left.seen["kitchen"] == ("Mug",)
     assert left.seen["bedroom"] == ()
     assert left.unseen["living_room"] == ("Laptop",)
-    with pytest.raises(ValueError, match="none of the training rooms of split 18/4, FloorPlan1 to"):
+    with pytest.raises(ValueError, match=r"none of the training rooms of split 18/4 .* 1 rooms"):
         split.within({"Lab"}, {"Mug"})

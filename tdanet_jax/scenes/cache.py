@@ -10,6 +10,8 @@ import hashlib
 import importlib
 import inspect
 import os
+import shutil
+import time
 import warnings
 from pathlib import Path
 
@@ -20,6 +22,10 @@ from tdanet_jax.scenes import ithor, tables
 from tdanet_jax.vocabulary import ALL_TARGETS
 
 VARIABLE = "TDANET_CACHE"
+#: What nobody has used for so long is removed when new tables are stored.
+FORGOTTEN_DAYS = 30
+#: Names of the tables, and of the folders in which imports keep their parts.
+TABLES, IMPORTS = "ithor-", "import-"
 _MODULES = (
     "archive",
     "scene",
@@ -56,7 +62,7 @@ def load_tables(progress: tables.Progress | None = None) -> tables.SceneTables:
     A cached file whose checksum is wrong is rebuilt with a warning. Where the cache cannot be
     written the tables are computed all the same.
     """
-    path = folder() / f"ithor-{key()}.npz"
+    path = folder() / f"{TABLES}{key()}.npz"
     if (found := _read(path)) is not None:
         return found
     with contextlib.ExitStack() as stack:
@@ -68,6 +74,7 @@ def load_tables(progress: tables.Progress | None = None) -> tables.SceneTables:
         result = tables.build(ithor.load_scenes(), progress=progress)
         try:
             _store(result, path)
+            _remove_forgotten(path.parent)
         except OSError as error:
             warnings.warn(f"{path}: not cached ({error.strerror})", stacklevel=2)
     return result
@@ -89,10 +96,34 @@ def _read(path: Path) -> tables.SceneTables | None:
     """The cached tables, or None if they are missing or not those whose checksum was written."""
     try:
         if path.with_suffix(".sha256").read_text(errors="replace").strip() == assets.sha256(path):
+            touch(path)
             return tables.SceneTables.load(path)
     except OSError:
         pass
     return None
+
+
+def touch(path: Path) -> None:
+    """Marks a file or folder of the cache as used now; where it cannot be written, it is not."""
+    with contextlib.suppress(OSError):
+        os.utime(path)
+
+
+def _remove_forgotten(place: Path) -> None:
+    """Removes tables and parts of imports that nobody has used for long. Under the lock.
+
+    A process that reads them has them open, or computes anew what it does not find.
+    """
+    oldest = time.time() - FORGOTTEN_DAYS * 86400
+    for path in [*place.glob(f"{TABLES}*.npz"), *place.glob(f"{IMPORTS}*")]:
+        with contextlib.suppress(OSError):
+            if path.stat().st_mtime >= oldest:
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+                path.with_suffix(".sha256").unlink()
 
 
 def _store(result: tables.SceneTables, path: Path) -> None:

@@ -12,10 +12,16 @@ import numpy as np
 
 from tdanet_jax import files
 from tdanet_jax.scenes import archive, cache
-from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.scenes.scene import MOST_CLASSES, Scene, SceneObject
 from tdanet_jax.scenes.tables import Progress, SceneTables
 from tdanet_jax.untrusted import FileError, npz
-from tdanet_jax.vocabulary import ROOM_TYPES
+from tdanet_jax.vocabulary import (
+    PARTS,
+    ROOM_TYPES,
+    TRAIN_SCENES_PER_TYPE,
+    VALIDATION_TRAIN_SCENES_PER_TYPE,
+    Split,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +46,7 @@ class Extras:
       episodes: published test episodes.
       graph_classes: n class names, one for each row of `adjacency`.
       adjacency: [n, n] float32, the published class graph; [0, 0] if there is none.
+      parts: room -> "train" or "test", for rooms that say it themselves.
     """
 
     parents: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(
@@ -48,6 +55,7 @@ class Extras:
     episodes: Sequence[PublishedEpisode] = ()
     graph_classes: tuple[str, ...] = ()
     adjacency: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    parts: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def class_graph(self, classes: Sequence[str]) -> np.ndarray | None:
         """The class graph between `classes`: [C, C] float32, or None if there is none.
@@ -96,6 +104,7 @@ def save(rooms: Rooms, path: Path) -> None:
         "parents": extras.parents,
         "episodes": [dataclasses.astuple(episode) for episode in extras.episodes],
         "graph_classes": extras.graph_classes,
+        "parts": extras.parts,
     }
     arrays = rooms.tables.to_arrays()
     arrays["extras/notes"] = np.frombuffer(json.dumps(notes).encode(), np.uint8)
@@ -130,6 +139,9 @@ def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
     names, adjacency = tuple(notes["graph_classes"]), arrays["extras/adjacency"]
     if adjacency.shape != (len(names), len(names)) or adjacency.dtype != np.float32:
         raise ValueError("the class graph does not match its names")
+    parts = notes.get("parts", {})  # older files have none
+    if not set(parts.values()) <= set(PARTS):
+        raise ValueError(f"a room that is for neither of {', '.join(PARTS)}")
     return Extras(
         parents={
             str(room): {
@@ -141,7 +153,30 @@ def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
         episodes=[PublishedEpisode(*values) for values in notes["episodes"]],
         graph_classes=names,
         adjacency=adjacency,
+        parts=parts,
     )
+
+
+def with_own_rooms(split: Split, rooms: Rooms, validation: bool = False) -> Split:
+    """A split, to which the rooms belong that say themselves which part they are for.
+
+    Other rooms stay what the split says by their names. With `validation`, those that say "test"
+    are left out, and of those of a room type that say "train" the last fifth, as of iTHOR's, are
+    evaluated.
+    """
+    tables, parts = rooms.tables, {} if rooms.extras is None else rooms.extras.parts
+    train = [name for name in split.train_scenes if name not in parts]
+    evaluated = [name for name in split.eval_scenes if name not in parts]
+    for kind in range(len(ROOM_TYPES)):
+        own = [n for n, k in zip(tables.scenes, tables.room_type, strict=True) if k == kind]
+        mine = [name for name in own if parts.get(name) == "train"]
+        rest = [name for name in own if parts.get(name) == "test"]
+        if validation:
+            first = len(mine) * VALIDATION_TRAIN_SCENES_PER_TYPE // TRAIN_SCENES_PER_TYPE
+            mine, rest = mine[:first], mine[first:]
+        train += mine
+        evaluated += rest
+    return dataclasses.replace(split, train_scenes=tuple(train), eval_scenes=tuple(evaluated))
 
 
 def as_scene(tables: SceneTables) -> Scene:
@@ -163,8 +198,8 @@ def find_problem(tables: SceneTables) -> str | None:
     for names in (tables.scenes, tables.classes, tables.targets, tables.object_id):
         if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
             return "names that are no text"
-    if min(sizes[letter] for letter in "RPOC") == 0 or len(tables.classes) > 127:
-        return "no rooms, positions, objects or classes, or over 127 classes"
+    if min(sizes[letter] for letter in "RPOC") == 0 or len(tables.classes) > MOST_CLASSES:
+        return f"no rooms, positions, objects or classes, or over {MOST_CLASSES} classes"
     for field, (dtype, shape, low, high) in _FIELDS.items():
         value: Any = getattr(tables, field)
         wanted = tuple(sizes.get(size, size) for size in shape)

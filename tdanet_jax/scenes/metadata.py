@@ -6,12 +6,15 @@ A scene file is JSON: one scene or a list of scenes, each an object with
     room_type            kitchen, living_room, bedroom or bathroom
     objects              controller.last_event.metadata["objects"]
     reachable_positions  the actionReturn of GetReachablePositions, gridSize 0.25
+    split                optional, train or test: the part of every split that the room belongs to;
+                         without it the name decides, if it is one of iTHOR's rooms
     agent                optional, metadata["agent"] at the time: lets the flags be verified
 
 Of each object are read objectId, objectType, axisAlignedBoundingBox and, where they are,
 objectOrientedBoundingBox, rotation, openable, isOpen, pickupable, parentReceptacles, visible.
 """
 
+import dataclasses
 import json
 import math
 from collections import Counter
@@ -21,10 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax import words
 from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.scene import GRID, Scene, SceneObject
-from tdanet_jax.vocabulary import ROOM_TYPES
+from tdanet_jax.vocabulary import PARTS, ROOM_TYPES
 
 IGNORED = "Floor"  # neither hides nor is looked for; its box spans the room
 ALIGNED = 0.02  # metres by which a point may miss the grid
@@ -174,6 +176,8 @@ def _read_scene(path: Path, document: Any) -> Scene:
     for key in ("objects", "reachable_positions"):
         if not isinstance(document.get(key), list):
             raise SceneError(f"{name}: {key} is not a list")
+    if document.get("split") not in (None, *PARTS):
+        raise SceneError(f"{name}: split {document['split']!r}, not {' or '.join(PARTS)}")
     points = [
         _vector(name, f"reachable_positions[{i}]", {"position": point}, "position")
         for i, point in enumerate(document["reachable_positions"])
@@ -181,7 +185,7 @@ def _read_scene(path: Path, document: Any) -> Scene:
     position, rotation = None, None
     if document.get("agent") is not None:
         position, rotation = _agent(name, document["agent"])
-    return parse_scene(
+    scene = parse_scene(
         name,
         ROOM_TYPES.index(document["room_type"]),
         document["objects"],
@@ -189,6 +193,7 @@ def _read_scene(path: Path, document: Any) -> Scene:
         position,
         rotation,
     )
+    return dataclasses.replace(scene, part=document.get("split"))
 
 
 def _agent(scene: str, agent: Any) -> tuple[np.ndarray | None, int | None]:
@@ -203,18 +208,3 @@ def _agent(scene: str, agent: Any) -> tuple[np.ndarray | None, int | None]:
     if abs(horizon) > 1 or abs((turn + 22.5) % 45 - 22.5) > 1:
         return None, None
     return position, round(turn / 45) * 45 % 360
-
-
-def check_classes(scenes: Sequence[Scene]) -> None:
-    """Every class must have a word vector, or no model could tell it from others.
-
-    Raises:
-        SceneError: a class has none; names scene, object and the word.
-    """
-    vectors = words.load_bundled()
-    for scene in scenes:
-        for item in scene.objects:
-            try:
-                vectors.embed(item.object_class)
-            except KeyError as error:
-                raise SceneError(f"{scene.name}: {item.object_id}: {error.args[0]}") from None

@@ -8,7 +8,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle, Wedge
 
 from tdanet_jax import files
-from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.floor_plan import area, footprint
 from tdanet_jax.scenes.geometry import HORIZONS, VIEWS
 from tdanet_jax.scenes.rules import RULES
@@ -17,21 +16,6 @@ from tdanet_jax.scenes.solids import void_boxes
 from tdanet_jax.scenes.tables import SceneTables
 
 VISIBLE, SEEN, QUIET = "#c0392b", "#2c6fbb", "#9aa5ad"
-
-
-def nearest_state(tables: SceneTables, x: float, z: float, rotation: int, horizon: int) -> int:
-    """The state at the reachable point nearest to (x, z) metres.
-
-    Raises:
-        SceneError: rotation is not a multiple of 45, or horizon neither 0 nor 30.
-    """
-    if rotation % 45:
-        raise SceneError(f"rotation {rotation}: not a multiple of 45 degrees")
-    if horizon not in (0, 30):
-        raise SceneError(f"horizon {horizon}: neither 0 nor 30 degrees")
-    offset = tables.position[:, [0, 2]] - (x, z)
-    position = int((offset**2).sum(axis=1).argmin())
-    return (position * (VIEWS // HORIZONS) + rotation // 45 % 8) * HORIZONS + horizon // 30
 
 
 def most_telling_state(tables: SceneTables) -> int:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+MOST_CLASSES = 127  # of the rooms together: the raster numbers them in int8
 GRID = 0.25  # metres between neighbouring reachable points
 REACH = 1.5  # metres, horizontal distance within which AI2-THOR calls an object visible
 CAMERA_ABOVE_AGENT = 0.675  # metres from the agent's y to its camera, AI2-THOR's default agent
@@ -35,3 +36,4 @@ class Scene:
     objects: tuple[SceneObject, ...]  # sorted by (class, id)
     default_position: np.ndarray | None = None  # [3] float64, agent in the metadata's frame
     default_rotation: int | None = None  # degrees clockwise from +z, horizon 0
+    part: str | None = None  # "train" or "test" of every split; None where the name decides

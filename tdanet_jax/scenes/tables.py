@@ -8,6 +8,7 @@ apart, clockwise from +z, horizon 0 looks level and 1 looks 30 degrees down.
 import dataclasses
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
@@ -19,6 +20,8 @@ import numpy as np
 from tdanet_jax.scenes import archive
 from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.geometry import (
+    HEADINGS,
+    HORIZONS,
     VIEWS,
     action_distances,
     next_positions,
@@ -26,12 +29,14 @@ from tdanet_jax.scenes.geometry import (
 )
 from tdanet_jax.scenes.raster import paint
 from tdanet_jax.scenes.rules import RULES, Rules
-from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene
+from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, MOST_CLASSES, Scene
 from tdanet_jax.scenes.visibility import IMAGE, SUBPIXEL, Sight, look_around
 from tdanet_jax.untrusted import npz
 from tdanet_jax.vocabulary import ALL_TARGETS
 
 FIELD_OF_VIEW = 90.0
+#: Rooms that are computed at once, where there are as many cores; bounds the memory.
+MOST_WORKERS = 8
 
 Progress = Callable[[int, int], None]
 
@@ -90,6 +95,21 @@ class SceneTables:
         visible[self.row_state[self.row_visible], self.row_class[self.row_visible]] = True
         octets = np.packbits(visible, axis=1, bitorder="little")
         return octets.view("<u4").astype(np.uint32)
+
+    def nearest_state(self, scene: int, x: float, z: float, rotation: int, horizon: int = 0) -> int:
+        """The state at a scene's reachable point nearest to (x, z) metres.
+
+        Raises:
+            SceneError: rotation is not a multiple of 45, or horizon neither 0 nor 30.
+        """
+        if rotation % 45:
+            raise SceneError(f"rotation {rotation}: not a multiple of 45 degrees")
+        if horizon not in (0, 30):
+            raise SceneError(f"horizon {horizon}: neither 0 nor 30 degrees")
+        here = np.flatnonzero(self.position_scene == scene)
+        offset = self.position[here][:, [0, 2]] - (x, z)
+        position = int(here[(offset**2).sum(axis=1).argmin()])
+        return (position * HEADINGS + rotation // 45 % HEADINGS) * HORIZONS + horizon // 30
 
     @cached_property
     def data_version(self) -> str:
@@ -201,6 +221,9 @@ def build(
     Args:
         classes: the vocabulary; by default the classes that occur, sorted.
         progress: called with (rooms done, rooms in all).
+
+    Raises:
+        SceneError: there are more classes than the tables can number, or fewer than occur.
     """
     names = tuple(
         sorted({item.object_class for scene in scenes for item in scene.objects})
@@ -208,11 +231,14 @@ def build(
         else classes
     )
 
+    if len(names) > MOST_CLASSES:
+        raise SceneError(f"{len(names)} classes, more than {MOST_CLASSES}")
+
     def work(scene: Scene) -> Room:
         return _build_room(scene, names, targets, rules)
 
     rooms = []
-    with ThreadPoolExecutor(max_workers=2) as pool:
+    with ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, MOST_WORKERS)) as pool:
         for room in pool.map(work, scenes):
             rooms.append(room)
             if progress is not None:
@@ -244,7 +270,7 @@ def tabulate(
 
     Args:
         next_position: [P, 8] where MoveAhead leads. sight: what is seen from each state.
-        classes: the vocabulary, with all classes of the room; at most 127.
+        classes: the vocabulary, with all classes of the room; at most `MOST_CLASSES`.
     """
     index = {name: i for i, name in enumerate(classes)}
     object_class = np.array([index[item.object_class] for item in scene.objects], np.int16)

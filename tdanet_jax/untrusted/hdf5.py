@@ -79,6 +79,14 @@ def _count(shape: tuple[int, ...]) -> int:
     return total
 
 
+def need_h5py(path: Path) -> None:
+    """Raises FileError, before a file is read or written, if h5py is not installed."""
+    try:
+        import h5py  # noqa: F401
+    except ImportError:
+        raise FileError(path, "needs h5py: pip install h5py") from None
+
+
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Reader]:
     """Opens a file to read from it.
@@ -86,10 +94,9 @@ def opened(path: Path) -> Iterator[Reader]:
     Raises:
         FileError: it is missing or no HDF5 file, or h5py is not installed.
     """
-    try:
-        import h5py
-    except ImportError:
-        raise FileError(path, "needs h5py: pip install 'tdanet-jax[offline]'") from None
+    need_h5py(path)
+    import h5py
+
     if not path.is_file():
         raise FileError(path, "no such file")
     with _plain_errors(path):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import tdanet_jax
 from experiments import evaluate, scenes, train_zero_shot
 from tdanet_jax.agent import Detection
 from tdanet_jax.scenes import SceneTables, dataset
+from tdanet_jax.scenes.offline import importer
 from tests import original
 from tests.conftest import SOME_ROOMS
 from tests.experiments.command import TINY
@@ -20,8 +23,6 @@ from tests.experiments.command import TINY
 @pytest.fixture(autouse=True)
 def parts_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Imports keep their parts in a cache of their own; the bundled tables stay where they are."""
-    from tdanet_jax.scenes.offline import importer
-
     monkeypatch.setattr(importer, "_parts_folder", lambda root: tmp_path / "parts")
 
 
@@ -74,6 +75,62 @@ def test_the_miniature_trains_and_evaluates(
     seen = [Detection("table top", 0, 0, 1, 1)]
     _, decision = agent.act(agent.start(), seen, target="mug")
     assert decision.probabilities.shape == (6,)
+
+
+def write_features(place: Path) -> None:
+    """Feature maps of a scene of the miniature, all ones."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(place / "resnet18_featuremap.hdf5", "w") as file:
+        for key in original.KEYS:
+            file.create_dataset(key, data=np.ones((512, 7, 7), np.float32), compression="gzip")
+
+
+def test_an_import_that_was_stopped_goes_on_where_it_was(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever stops it: a scene is read once until all is written, and is then forgotten."""
+    monkeypatch.chdir(tmp_path)
+    source = original.write_all(tmp_path / "original")
+    command = ["import", "--from", "original/data", "--features", "--out", "rooms.npz"]
+    read: list[str] = []
+    plain = importer.read_scene
+    monkeypatch.setattr(
+        importer, "read_scene", lambda *given: (read.append(given[1]), plain(*given))[1]
+    )
+    write_features(source / "FloorPlan1")
+    message = fails(scenes, command, capsys)  # before anything is read
+    assert "FloorPlan21_physics/resnet18_featuremap.hdf5: no such file" in message
+    assert read == []
+    write_features(source / "FloorPlan21_physics")
+    for where, what in ((importer, "write_features"), (dataset, "save")):
+
+        def stop(*_: Any) -> None:
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(where, what, stop)
+            with pytest.raises(SystemExit):
+                scenes.main(command)
+        assert not list(tmp_path.glob("*rooms*"))
+        assert len(list((tmp_path / "parts").iterdir())) == 2
+    scenes.main(command)
+    assert read == ["FloorPlan1", "FloorPlan21"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "original", "rooms.features.npy", "rooms.npz"
+    ]  # fmt: skip
+    rooms = dataset.load(tmp_path / "rooms.npz")
+    assert (importer.load_features(tmp_path / "rooms.npz", rooms.tables) == 1).all()
+
+
+def test_an_import_of_feature_maps_asks_for_h5py_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = original.write_all(tmp_path / "original")
+    write_features(source / "FloorPlan1")
+    monkeypatch.setitem(sys.modules, "h5py", None)  # as if it were not installed
+    given = ["--from", str(source), "--features", "--out", str(tmp_path / "rooms.npz")]
+    assert "needs h5py: pip install h5py\n" in fails(scenes, ["import", *given], capsys)
+    assert not (tmp_path / "parts").exists()
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
 from pathlib import Path
 
@@ -12,15 +11,7 @@ import pytest
 import tdanet_jax
 from tdanet_jax.agent import Detection
 from tests.experiments import command
-
-PAGE = Path(__file__).parent.parent.parent / "docs" / "models.md"
-
-
-def block(name: str) -> str:
-    """The code below the comment of this name on the page."""
-    found = re.search(rf"<!-- {re.escape(name)} -->\n```\w+\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert found is not None, name
-    return found.group(1)
+from tests.experiments.pages import block
 
 
 @pytest.mark.usefixtures("ithor")  # the rooms are there: no line about computing them
@@ -28,8 +19,8 @@ def test_the_example_on_the_page_is_a_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "my_lab").mkdir()
-    (tmp_path / "my_lab" / "most_alike.py").write_text(block("most_alike.py"))
-    python, _, module, *given = shlex.split(block("most_alike command"))
+    (tmp_path / "my_lab" / "most_alike.py").write_text(block("models.md", "most_alike.py"))
+    python, _, module, *given = shlex.split(block("models.md", "most_alike command"))
     assert (python, module) == ("python", "experiments.train_zero_shot")
     small = ("--steps", "400", "--history", "0", *command.TINY)
     done = command.run("train_zero_shot", *given, *small, cwd=tmp_path)

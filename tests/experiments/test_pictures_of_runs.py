@@ -11,12 +11,26 @@ import sys
 import numpy as np
 import pytest
 
-from experiments import attention, replay, trajectories
-from tdanet_jax import episodes
+from experiments import attention, evaluate, replay, trajectories
+from tdanet_jax import devices, episodes
 from tdanet_jax.scenes import dataset
 from tdanet_jax.scenes.offline import importer
 from tests import browser, original
 from tests.conftest import TINY, save_untrained
+
+
+@pytest.mark.parametrize("command", [replay, trajectories, attention, evaluate])
+def test_what_is_compiled_is_kept_for_the_next_start(monkeypatch, capsys, opinionated_run, command):
+    """From the first program on: when that is compiled, JAX decides whether it keeps any."""
+
+    def keep():
+        raise ValueError("compiled programs are kept")
+
+    monkeypatch.setattr(devices, "keep_compiled", keep)
+    chosen = [] if command is evaluate else ["--scene", "FloorPlan229", "--target", "Painting"]
+    with pytest.raises(SystemExit):
+        command.main(["--checkpoint", str(opinionated_run), *chosen, "--data", "nowhere.npz"])
+    assert "compiled programs are kept" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", [replay, trajectories, attention])

@@ -1,12 +1,16 @@
 """The command: what it writes, and one clear line where it cannot."""
 
+import importlib
 import json
+import shlex
 from pathlib import Path
 
 import pytest
 
 from experiments import scenes
 from tdanet_jax.scenes import SceneTables
+from tests.experiments.command import TINY
+from tests.experiments.pages import block
 from tests.scenes.test_metadata import DOCUMENT
 
 
@@ -15,6 +19,57 @@ def scene_file(tmp_path: Path) -> Path:
     path = tmp_path / "lab.json"
     path.write_text(json.dumps(DOCUMENT))
     return path
+
+
+def test_own_rooms_as_the_page_shows_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From the scene file to a trained agent."""
+    monkeypatch.chdir(tmp_path)
+    Path("my_rooms.json").write_text(block("scenes.md", "my_rooms.json"))
+    for line in block("scenes.md", "my_rooms commands").splitlines():
+        python, _, module, *given = shlex.split(line)
+        assert python == "python"
+        small = ("--steps", "80", *TINY) if module.endswith("train_zero_shot") else ()
+        importlib.import_module(module).main([*given, *small])
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert "Rooms to train in: 1; to be evaluated in: 1" in said.out
+    for folder in ("random-in-my-rooms", "in-my-rooms"):
+        results = json.loads(Path("runs", folder, "results.json").read_text())
+        assert results["seen"]["L>=1"]["n"] == 250
+        assert list(results["by_room"]) == ["kitchen"]
+        assert results["unseen"] is None
+        rows = Path("runs", folder, "episodes.jsonl").read_text().splitlines()
+        assert {json.loads(row)["scene"] for row in rows} == {"Office"}
+
+
+def test_rooms_that_no_split_uses_and_words_without_vectors_are_said(
+    scene_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    named = {**DOCUMENT, "name": "FloorPlan5"}
+    named["objects"] = [{**DOCUMENT["objects"][0], "objectType": "MugXqzzy"}]
+    scene_file.write_text(json.dumps([DOCUMENT, named]))
+    scenes.main(["import", str(scene_file), "--out", str(scene_file.with_name("lab.npz"))])
+    said = capsys.readouterr()
+    assert said.err.startswith("warning: no split uses Lab; a run needs a room to train in")
+    assert len(said.err.splitlines()) == 1
+    assert "Rooms to train in: 1; to be evaluated in: 0" in said.out
+    assert "Needs --word-vectors: no bundled ones for MugXqzzy (xqzzy)" in said.out
+
+
+def test_more_classes_than_can_be_numbered(
+    scene_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    things = [
+        {**DOCUMENT["objects"][0], "objectId": f"{i}", "objectType": f"Thing{i}"}
+        for i in range(128)
+    ]
+    scene_file.write_text(json.dumps({**DOCUMENT, "objects": things}))
+    out = scene_file.with_name("lab.npz")
+    message = fails(["import", str(scene_file), "--out", str(out)], capsys)
+    assert "lab.json: 128 classes, more than 127" in message
+    assert not out.exists()
 
 
 def test_import(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -10,13 +11,16 @@ import numpy as np
 import pytest
 
 from tdanet_jax import files
-from tdanet_jax.scenes import cache, ithor, tables, toy
+from tdanet_jax.scenes import cache, ithor, tables
+from tests import toy
 
 # Builds (slowly enough to overlap) and prints the tables' version.
 BUILDER = """
 import time
 import numpy as np
-from tdanet_jax.scenes import cache, ithor, toy
+from tdanet_jax.scenes import cache, ithor
+from tests import toy
+from tests import toy
 def rooms():
     print("building", flush=True)
     time.sleep(2.0)
@@ -117,6 +121,36 @@ def test_a_builder_that_is_killed_leaves_no_lock_and_no_litter(tmp_path: Path) -
 
 def files_of(folder: Path) -> list[Path]:
     return [path for path in folder.iterdir() if path.name != files.LOCK_FILE]
+
+
+def test_what_nobody_has_used_for_long_is_removed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When tables are stored: other tables and parts of imports, and nothing else."""
+    before = time.time() - 86400 * (cache.FORGOTTEN_DAYS + 1)
+    folder.mkdir()
+    for name in ("old", "used", "new"):
+        for path in (folder / f"ithor-{name}.npz", folder / f"ithor-{name}.sha256",
+                     folder / f"import-1-{name}" / "FloorPlan1.npz"):  # fmt: skip
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(name)
+    (folder / "compiled").mkdir()
+    (folder / "mine.npz").write_text("of the user")
+    for path in folder.iterdir():
+        if "-new" not in path.name:
+            os.utime(path, (before, before))
+    cache.touch(folder / "ithor-used.npz")  # as reading them does
+    cache.touch(folder / "import-1-used")
+    cache.touch(folder / "nowhere")
+    monkeypatch.setattr(cache, "key", lambda: "now")
+    cache.load_tables()
+    left = {"ithor-now.npz", "ithor-now.sha256", "compiled", "mine.npz", files.LOCK_FILE}
+    for name in ("used", "new"):
+        left |= {f"ithor-{name}.npz", f"ithor-{name}.sha256", f"import-1-{name}"}
+    assert {path.name for path in folder.iterdir()} == left
+    os.utime(folder / "ithor-now.npz", (before, before))
+    cache.load_tables()
+    assert (folder / "ithor-now.npz").stat().st_mtime > time.time() - 3600
 
 
 def test_the_platforms_place_by_default(monkeypatch: pytest.MonkeyPatch) -> None:

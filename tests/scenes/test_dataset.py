@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tdanet_jax.scenes import SceneTables, archive, dataset, tables, toy
+from tdanet_jax.scenes import SceneTables, archive, dataset, tables
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode, Rooms
 from tdanet_jax.untrusted import FileError
+from tdanet_jax.vocabulary import make_split
+from tests import toy
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +26,7 @@ def rooms() -> SceneTables:
 def test_rooms_come_back_with_their_extras(rooms: SceneTables, tmp_path: Path) -> None:
     episode = PublishedEpisode("test", "Room1", 0.25, -0.5, 45, 30, "Mug")
     extras = Extras({"kitchen": {"Mug": {"Sofa": 0.5}}}, (episode,), ("A", "B"),
-                    np.eye(2, dtype=np.float32))  # fmt: skip
+                    np.eye(2, dtype=np.float32), {"Room2": "test"})  # fmt: skip
     path = tmp_path / "rooms.npz"
     dataset.save(Rooms(rooms, extras), path)
     back = dataset.load(path)
@@ -31,6 +34,8 @@ def test_rooms_come_back_with_their_extras(rooms: SceneTables, tmp_path: Path) -
     assert (back.extras.parents, list(back.extras.episodes)) == (extras.parents, [episode])
     assert back.extras.graph_classes == ("A", "B")
     np.testing.assert_array_equal(back.extras.adjacency, np.eye(2))
+    assert back.extras.parts == {"Room2": "test"}
+    assert back.path == path
     assert back.tables.scenes == rooms.scenes
     assert set(back.tables.targets) == set(rooms.targets) & set(rooms.classes)
     assert SceneTables.load(path).data_version == rooms.data_version
@@ -81,6 +86,44 @@ def test_numbers_that_contradict_each_other(rooms: SceneTables, tmp_path: Path, 
     assert str(error.value).isprintable()
 
 
+def notes(**values: Any) -> np.ndarray:
+    whole = {"parents": {}, "episodes": [], "graph_classes": [], **values}
+    return np.frombuffer(json.dumps(whole).encode(), np.uint8)
+
+
+def test_files_that_were_written_before_rooms_could_say_what_they_are_for(
+    rooms: SceneTables, tmp_path: Path
+) -> None:
+    path, empty = tmp_path / "rooms.npz", np.zeros((0, 0), np.float32)
+    archive.write(path, {**rooms.to_arrays(), "extras/notes": notes(), "extras/adjacency": empty})
+    extras = dataset.load(path).extras
+    assert extras is not None
+    assert extras.parts == {}
+
+
+def test_rooms_that_say_what_they_are_for() -> None:
+    """Own names and iTHOR's, what is said before what the name says; validation takes a fifth."""
+    corridor = toy.corridor()
+    kinds = {"FloorPlan1": 0, "FloorPlan2": 0, "FloorPlan30": 0, "Attic": 2, "Den": 0, "Hall": 0}
+    kinds |= {f"Own{i}": 1 for i in range(5)}
+    scenes = [
+        dataclasses.replace(corridor, name=name, room_type=kind) for name, kind in kinds.items()
+    ]
+    parts = {"FloorPlan2": "test", "Den": "train", "Hall": "test"}
+    parts |= {f"Own{i}": "train" for i in range(5)}
+    rooms = Rooms(tables.build(scenes), Extras(parts=parts))
+    found = {}
+    for validation in (False, True):
+        split = dataset.with_own_rooms(make_split("18/4", validation), rooms, validation)
+        split = split.within(kinds, ("Apple",))
+        found[validation] = set(split.train_scenes), set(split.eval_scenes)
+    own = {f"Own{i}" for i in range(5)}
+    assert found[False] == ({"FloorPlan1", "Den"} | own, {"FloorPlan2", "FloorPlan30", "Hall"})
+    assert found[True] == ({"FloorPlan1"} | own - {"Own4"}, {"Den", "Own4"})
+    split = make_split("18/4")
+    assert dataset.with_own_rooms(split, Rooms(rooms.tables, None)) == split
+
+
 def test_other_archives(rooms: SceneTables, tmp_path: Path) -> None:
     path = tmp_path / "rooms.npz"
     arrays = rooms.to_arrays()
@@ -88,7 +131,12 @@ def test_other_archives(rooms: SceneTables, tmp_path: Path) -> None:
         {"rest": np.frombuffer(b"{", np.uint8)},
         {"extras/notes": np.frombuffer(b"[]", np.uint8)},
         {"unknown": np.zeros(3)},
+        {"extras/notes": notes(parts={"Room1": "train"}, episodes=3)},
+        {"extras/notes": notes(parts={"Room1": "both"})},
+        {"extras/notes": notes(parts={"Room1": ["train"]})},
+        {"extras/notes": notes(parts=["Room1"])},
     ):
+        change = {"extras/adjacency": np.zeros((0, 0), np.float32), **change}
         archive.write(path, {**arrays, **change})
         with pytest.raises(FileError, match=r"rooms\.npz: not a file of rooms"):
             dataset.load(path)

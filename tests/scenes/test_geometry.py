@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from tdanet_jax.scenes import geometry, toy
+from tdanet_jax.scenes import geometry
+from tests import toy
 
 AHEAD, LEFT, RIGHT, UP, DOWN = range(5)
 

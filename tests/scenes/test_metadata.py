@@ -71,6 +71,11 @@ def test_a_list_of_scenes(tmp_path: Path) -> None:
     assert second.default_position is None
 
 
+def test_a_room_may_say_what_it_is_for(tmp_path: Path) -> None:
+    assert [scene.part for scene in read(tmp_path, DOCUMENT)] == [None]
+    assert [scene.part for scene in read(tmp_path, {**DOCUMENT, "split": "test"})] == ["test"]
+
+
 @pytest.mark.parametrize(("horizon", "turn"), [(30.0, 0.0), (0.0, 20.0)])
 def test_odd_poses_are_not_default_frames(tmp_path: Path, horizon: float, turn: float) -> None:
     document = copy.deepcopy(DOCUMENT)
@@ -110,6 +115,8 @@ CASES = [
     (["objects", 0, "parentReceptacles"], 3, r"Lab: Mug\|1: parentReceptacles"),
     (["room_type"], "hall", "Lab: room_type 'hall'"),
     (["name"], None, "a scene without a name"),
+    (["split"], "half", "Lab: split 'half', not train or test"),
+    (["split"], ["test"], "Lab: split "),
     (["agent"], 3, "Lab: agent"),
     (["agent", "position"], None, "Lab: agent"),
     (["agent", "cameraHorizon"], "level", "Lab: agent"),
@@ -138,13 +145,6 @@ def test_a_name_taken_twice(tmp_path: Path) -> None:
         read(tmp_path, [DOCUMENT, DOCUMENT])
 
 
-def test_classes_need_word_vectors(tmp_path: Path) -> None:
-    document = broken(["objects", 0, "objectType"], "Xqzzy")
-    with pytest.raises(SceneError, match=r"Lab: Mug\|1: no word vector"):
-        metadata.check_classes(read(tmp_path, document))
-    metadata.check_classes(read(tmp_path, DOCUMENT))
-
-
 anything = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: (
@@ -166,6 +166,7 @@ places = st.sampled_from(
         ["agent", "cameraHorizon"],
         ["name"],
         ["room_type"],
+        ["split"],
     ]
 )
 

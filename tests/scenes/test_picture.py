@@ -1,20 +1,11 @@
-"""Poses are understood and pictures are written."""
+"""Views are chosen and pictures are written."""
 
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from tdanet_jax.scenes import SceneError, picture, tables, toy
-
-
-def test_states_of_poses() -> None:
-    t = tables.build([toy.corridor()])
-    assert picture.nearest_state(t, 0.1, 0.55, 90, 30) == (2 * 8 + 2) * 2 + 1
-    assert picture.nearest_state(t, 9.0, 9.0, -45, 0) == (4 * 8 + 7) * 2
-    for rotation, horizon in ((20, 0), (0, 45)):
-        with pytest.raises(SceneError):
-            picture.nearest_state(t, 0, 0, rotation, horizon)
+from tdanet_jax.scenes import picture, tables
+from tests import toy
 
 
 def test_the_most_telling_view() -> None:

@@ -2,7 +2,8 @@
 
 import dataclasses
 
-from tdanet_jax.scenes import SceneTables, survey, tables, toy
+from tdanet_jax.scenes import SceneTables, survey, tables
+from tests import toy
 
 RULES = dataclasses.replace(tables.RULES, void=100.0)  # toy rooms have no walls
 

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tdanet_jax.scenes import SceneError, SceneTables, geometry, tables, toy
+from tdanet_jax.scenes import SceneError, SceneTables, geometry, tables
 from tdanet_jax.scenes.scene import Scene
 from tdanet_jax.vocabulary import ALL_TARGETS
+from tests import toy
 
 # Of the bundled rooms. A change means that every published number has to be measured anew.
 DATA_VERSION = "d4909be88f83"
@@ -32,6 +33,41 @@ def test_the_bundled_rooms_are_the_same_everywhere(ithor: SceneTables) -> None:
     assert len(ithor.position) == 14_642
     assert ithor.targets == ALL_TARGETS
     assert len(ithor.classes) == 117
+
+
+def test_states_of_poses() -> None:
+    t = tables.build([toy.corridor(), dataclasses.replace(toy.corridor(), name="Second")])
+    assert t.nearest_state(0, 0.1, 0.55, 90, 30) == (2 * 8 + 2) * 2 + 1
+    assert t.nearest_state(0, 9.0, 9.0, -45) == (4 * 8 + 7) * 2
+    assert t.nearest_state(1, 9.0, 0.0, 360) == 5 * 16
+    for rotation, horizon in ((20, 0), (0, 45)):
+        with pytest.raises(SceneError):
+            t.nearest_state(0, 0, 0, rotation, horizon)
+
+
+def test_the_nearest_point_is_that_as_the_crow_flies() -> None:
+    """And not by the longer of its two sides: 0.28 m along z, or 0.25 m across and 0.22 m along."""
+    t = tables.build([toy.room(toy.points((0.0, 0.0), (0.25, 0.5)), toy.corridor().objects[0])])
+    assert t.nearest_state(0, 0.0, 0.28, 0) == 0
+    assert t.nearest_state(0, 0.1, 0.3, 0) == 16
+
+
+def test_however_many_rooms_are_computed_at_once_the_tables_are_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    versions = set()
+    for workers in (1, 3):
+        monkeypatch.setattr(tables, "MOST_WORKERS", workers)
+        monkeypatch.setattr(tables.os, "cpu_count", lambda: 4)
+        versions.add(tables.build(random_rooms(2)).data_version)
+    assert len(versions) == 1
+
+
+def test_no_more_classes_than_can_be_numbered() -> None:
+    names = [f"Thing{i}" for i in range(128)]
+    things = [toy.thing(name, (0.0, toy.CAMERA, 2.0)) for name in names]
+    with pytest.raises(SceneError, match="128 classes, more than 127"):
+        tables.build([toy.room(toy.line(1), *things)])
 
 
 @pytest.mark.parametrize("which", ["rooms", "some_rooms"])

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tdanet_jax.scenes import agreement, ithor, toy
+from tdanet_jax.scenes import agreement, ithor
 from tdanet_jax.scenes.rules import RULES, Rules
 from tdanet_jax.scenes.scene import Scene, SceneObject
 from tdanet_jax.scenes.solids import fronts_of, patches_of, solids_of, void_boxes
 from tdanet_jax.scenes.visibility import look_around
+from tests import toy
 
 BARE = dataclasses.replace(RULES, void=100.0)  # toy rooms have no walls
 MIDDLE = 2400  # of the image, in sixteenths of a pixel

@@ -27,7 +27,7 @@ from tdanet_jax.scenes.offline.layout import (
     state_keys,
 )
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.untrusted import FileError
+from tdanet_jax.untrusted import hdf5
 from tdanet_jax.vocabulary import ROOM_TYPES
 
 Parents = Mapping[str, Mapping[str, Mapping[str, float]]]
@@ -52,7 +52,7 @@ def write_folder(
             7 x 7 raster that show class c of `tables.classes`, 0 elsewhere.
     """
     if vectors is not None or features:
-        _need_h5py(out)
+        hdf5.need_h5py(out)
     fresh = out.with_name(f"{PARTIAL}{os.getpid()}-{out.name}")
     try:
         fresh.mkdir(parents=True)
@@ -164,13 +164,6 @@ def write_vectors(classes: Sequence[str], vectors: np.ndarray, folder: Path) -> 
     with h5py.File(folder / f"glove_map{vectors.shape[1]}d.hdf5", "w") as file:
         for name, vector in zip(classes, vectors, strict=True):
             file.create_dataset(name, data=vector.astype(np.float32))
-
-
-def _need_h5py(out: Path) -> None:
-    try:
-        import h5py  # noqa: F401
-    except ImportError:
-        raise FileError(out, "needs h5py: pip install 'tdanet-jax[offline]'") from None
 
 
 def _write(path: Path, content: Any) -> None:

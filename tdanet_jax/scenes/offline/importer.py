@@ -5,15 +5,17 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tdanet_jax import files
-from tdanet_jax.scenes import archive, cache
+from tdanet_jax.scenes import archive, cache, dataset
 from tdanet_jax.scenes.dataset import Rooms
+from tdanet_jax.scenes.geometry import VIEWS
 from tdanet_jax.scenes.offline.extras import read_extras
 from tdanet_jax.scenes.offline.layout import (
     BOX_FILE,
@@ -27,7 +29,7 @@ from tdanet_jax.scenes.offline.layout import (
     scene_of,
 )
 from tdanet_jax.scenes.offline.reader import SceneData, describe, read_scene
-from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.scenes.scene import MOST_CLASSES, Scene, SceneObject
 from tdanet_jax.scenes.tables import SceneTables, join, tabulate
 from tdanet_jax.scenes.visibility import Sight
 from tdanet_jax.untrusted import FileError, hdf5, npz
@@ -44,7 +46,7 @@ def read_folder(folder: Path, report: Report) -> Rooms:
     """The rooms of a folder of scenes, and what lies beside them.
 
     One scene's files are in memory at a time. Each scene is kept in the user's cache folder until
-    all are done, so that an import that was stopped goes on where it was.
+    `forget` is called, so that an import that was stopped goes on where it was.
 
     Args:
         folder: holds folders FloorPlan*, or holds one folder that does.
@@ -56,6 +58,7 @@ def read_folder(folder: Path, report: Report) -> Rooms:
     root = find_root(folder)
     chosen = find_scenes(root)
     parts = _parts_folder(root)
+    cache.touch(parts)
     rooms: list[SceneData] = []
     for name, room_type, place in chosen:
         data = _read_or_recall(parts, place, name, room_type)
@@ -74,7 +77,6 @@ def read_folder(folder: Path, report: Report) -> Rooms:
         report(
             1.0, f"parents that are no class of these rooms, left out: {', '.join(sorted(lost))}"
         )
-    _forget(parts)
     return result
 
 
@@ -122,8 +124,8 @@ def make_tables(root: Path, rooms: Sequence[SceneData]) -> SceneTables:
         FileError: there are more classes than the tables can number.
     """
     classes = tuple(sorted({o.object_class for data in rooms for o in data.scene.objects}))
-    if len(classes) > 127:
-        raise FileError(root, f"{len(classes)} classes, more than 127")
+    if len(classes) > MOST_CLASSES:
+        raise FileError(root, f"{len(classes)} classes, more than {MOST_CLASSES}")
     targets = tuple(name for name in ALL_TARGETS if name in classes)
     shares = [tabulate(d.scene, d.next_position, d.sight, classes, targets) for d in rooms]
     return join([data.scene for data in rooms], shares, classes, targets)
@@ -131,7 +133,7 @@ def make_tables(root: Path, rooms: Sequence[SceneData]) -> SceneTables:
 
 def _parts_folder(root: Path) -> Path:
     name = hashlib.sha256(str(root.resolve()).encode()).hexdigest()[:16]
-    return cache.folder() / f"import-{FORMAT}-{name}"
+    return cache.folder() / f"{cache.IMPORTS}{FORMAT}-{name}"
 
 
 def _read_or_recall(parts: Path, place: Path, name: str, room_type: int) -> SceneData:
@@ -186,38 +188,71 @@ def _unpack(stored: dict[str, np.ndarray], note: dict) -> SceneData:
     )
 
 
-def _forget(parts: Path) -> None:
-    with contextlib.suppress(OSError):
-        for part in parts.glob("*.npz"):
-            part.unlink()
-        parts.rmdir()
+def forget(folder: Path) -> None:
+    """Removes what is kept of the scenes of a folder; for when all of it is written elsewhere."""
+    shutil.rmtree(_parts_folder(find_root(folder)), ignore_errors=True)
 
 
-def write_features(folder: Path, tables: SceneTables, out: Path, report: Report) -> None:
+def find_features(folder: Path) -> dict[str, Path]:
+    """The feature file of each scene of a folder.
+
+    Raises:
+        FileError: a scene has none, or h5py, which reads them, is not installed.
+    """
+    found = {name: place / FEATURE_FILE for name, _, place in find_scenes(find_root(folder))}
+    for path in found.values():
+        hdf5.need_h5py(path)
+        if not path.is_file():
+            raise FileError(path, "no such file")
+    return found
+
+
+def save(
+    rooms: Rooms,
+    out: Path,
+    features: Mapping[str, Path] | None = None,
+    report: Report | None = None,
+) -> None:
+    """Writes a file of rooms and, beside it, their feature maps: both whole, or neither.
+
+    Args:
+        features: from `find_features`; None writes no maps.
+        report: called with the share done and a line for every scene's maps.
+
+    Raises:
+        FileError: a feature file is broken.
+    """
+    with contextlib.ExitStack() as stack:
+        if features is not None:
+            fresh = stack.enter_context(files.replacing(features_path(out)))
+            write_features(features, rooms.tables, fresh, report)
+        dataset.save(rooms, out)
+
+
+def write_features(
+    sources: Mapping[str, Path], tables: SceneTables, out: Path, report: Report | None = None
+) -> None:
     """Writes every scene's feature maps into one memory-mapped file.
 
     Args:
+        sources: the feature file of each scene.
         out: a .npy of [S, 512, 7, 7] float16, S states in the order of the tables; zero where a
-            scene's file has no map of a state. It appears whole or not at all.
+            scene's file has no map of a state.
 
     Raises:
-        FileError: a scene has no feature file, or one is broken.
+        FileError: a feature file is broken.
     """
-    root = find_root(folder)
-    places = {name: place for name, _, place in find_scenes(root)}
-    with files.replacing(out) as fresh:
-        features = np.lib.format.open_memmap(
-            fresh, "w+", np.float16, (tables.num_states, *FEATURE_SHAPE)
+    features = np.lib.format.open_memmap(out, "w+", np.float16, (tables.num_states, *FEATURE_SHAPE))
+    for i, name in enumerate(tables.scenes):
+        here = np.flatnonzero(tables.position_scene == i)
+        count = _copy_features(
+            sources[name], Grid(tables.position[here]), features, here[0] * VIEWS
         )
-        for i, name in enumerate(tables.scenes):
-            here = np.flatnonzero(tables.position_scene == i)
-            count = _copy_features(
-                places[name] / FEATURE_FILE, Grid(tables.position[here]), features, here[0] * 16
-            )
-            rest = len(here) * 16 - count
-            note = f"; {rest} states without one are zero" if rest else ""
+        rest = len(here) * VIEWS - count
+        note = f"; {rest} states without one are zero" if rest else ""
+        if report is not None:
             report((i + 1) / len(tables.scenes), f"{name}: {count} feature maps{note}")
-        features.flush()
+    features.flush()
 
 
 def _copy_features(path: Path, grid: Grid, features: np.ndarray, first: int) -> int:

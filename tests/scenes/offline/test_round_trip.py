@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 
 from tdanet_jax import words
 from tdanet_jax.reward import find_parents, named_parents, published_parents
-from tdanet_jax.scenes import SceneTables, dataset, tables, toy
+from tdanet_jax.scenes import SceneTables, dataset, tables
 from tdanet_jax.scenes.offline import exporter, importer, reader
 from tdanet_jax.scenes.offline.layout import OBJECT_FILE, state_keys
 from tdanet_jax.untrusted import FileError, hdf5
 from tdanet_jax.vocabulary import TARGETS, make_split
-from tests import original
+from tests import original, toy
 
 
 def silent(share: float, line: str) -> None:
@@ -55,7 +55,11 @@ def test_out_and_in_is_the_identity(some_rooms: SceneTables, tmp_path: Path) -> 
     back = importer.read_folder(tmp_path / "out", silent).tables
     assert_equal(rooms, back)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(rooms.scenes)
-    assert not list((tmp_path / "cache").glob("import-*")), "the parts of an import are removed"
+    assert sorted(path.name for path in (tmp_path / "cache").glob("import-*/*")) == [
+        "FloorPlan29.npz", "FloorPlan321.npz", "FloorPlan428.npz"
+    ]  # fmt: skip
+    importer.forget(tmp_path / "out")
+    assert list((tmp_path / "cache").iterdir()) == []
 
 
 def detections(t: SceneTables, exact: bool) -> tuple[Counter, set]:
@@ -160,8 +164,8 @@ def test_what_older_code_reads(some_rooms: SceneTables, tmp_path: Path) -> None:
     stored = words.load(out / "thor_glove" / "glove_map50d.hdf5")
     np.testing.assert_allclose(stored.table(room.classes), glove.table(room.classes), atol=1e-6)
 
-    features = tmp_path / "a.features.npy"
-    importer.write_features(out, room, features, silent)
+    sources = importer.find_features(out)
+    importer.save(dataset.Rooms(room, None), tmp_path / "a.npz", sources, silent)
     loaded = importer.load_features(tmp_path / "a.npz", room)
     assert loaded.shape == (room.num_states, 512, 7, 7)
     assert loaded.dtype == np.float16
@@ -177,9 +181,8 @@ def test_broken_features_leave_nothing_behind(some_rooms: SceneTables, tmp_path:
     h5py = pytest.importorskip("h5py")
     room = some_rooms.subset(["FloorPlan428"])
     exporter.write_folder(room, tmp_path / "out", silent)
-    features = tmp_path / "a.features.npy"
     with pytest.raises(FileError, match=r"featuremap\.hdf5: no such file"):
-        importer.write_features(tmp_path / "out", room, features, silent)
+        importer.find_features(tmp_path / "out")
     for name, data, reason in (
         (state_keys(room.position)[0], np.full((512, 7, 7), np.nan), "NaN"),
         (state_keys(room.position)[0], np.full((512, 7, 7), 1e6), "half precision"),
@@ -189,7 +192,12 @@ def test_broken_features_leave_nothing_behind(some_rooms: SceneTables, tmp_path:
         with h5py.File(tmp_path / "out/FloorPlan428/resnet18_featuremap.hdf5", "w") as file:
             file[name] = data
         with pytest.raises(FileError, match=rf"featuremap\.hdf5: .*{reason}"):
-            importer.write_features(tmp_path / "out", room, features, silent)
+            importer.save(
+                dataset.Rooms(room, None),
+                tmp_path / "a.npz",
+                importer.find_features(tmp_path / "out"),
+                silent,
+            )
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out"]
 
 
@@ -206,6 +214,7 @@ def test_parents_go_out_and_in(ithor: SceneTables) -> None:
 def test_a_stopped_import_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = original.write_all(tmp_path / "original")
     whole = importer.read_folder(source, silent).tables
+    importer.forget(source)
     read: list[str] = []
     plain = reader.read_scene
 
