@@ -37,7 +37,8 @@ class Command:
     """Folder of a run."""
     choice: tyro.conf.OmitArgPrefixes[Choice]
     out: Path | None = None
-    """Folder to write; by default <checkpoint>/attention."""
+    """Folder to write; by default <run>/attention-<policy>, for a point of the run's history
+    <run>/attention-<policy>-<updates>."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -53,10 +54,7 @@ def show(command: Command) -> None:
     from tdanet_jax import devices, files, pictures
 
     devices.keep_compiled()
-    choice, out = (
-        command.choice,
-        command.out or one_episode.folder_of(command.checkpoint) / "attention",
-    )
+    choice, out = command.choice, command.out or default_folder(command)
     runs = [command.checkpoint]
     rooms = one_episode.load_rooms(choice, runs)
     tables = rooms.tables
@@ -80,6 +78,13 @@ def show(command: Command) -> None:
         pictures.attention_episode(trace, tables, title, path)
     console.print(f"{trace.target} in {trace.scene}: {trace.outcome}")
     console.print(f"wrote {picture}")
+
+
+def default_folder(command: Command) -> Path:
+    """Where to write if nothing is said: another folder for each network and policy."""
+    point = f"-{command.checkpoint.stem}" if command.checkpoint.suffix == ".npz" else ""
+    name = f"attention-{command.choice.policy}{point}"
+    return one_episode.folder_of(command.checkpoint) / name
 
 
 def play_lists(player: Player, tables: SceneTables, seed: int) -> Played:

@@ -28,6 +28,7 @@ from rich.progress import (
 from rich.text import Text
 
 from tdanet_jax.files import LOCK_FILE, PARTIAL
+from tdanet_jax.vocabulary import GROUPS
 
 Arguments = TypeVar("Arguments")
 
@@ -253,7 +254,7 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
 
 def print_summary(results: Mapping[str, Any]) -> None:
     """One line per group: seen targets, 1000 episodes: SR 75.1 (70.2 to 80.0), SPL ..."""
-    for group in ("seen", "unseen"):
+    for group in GROUPS:
         if results[group] is None:
             continue
         bucket = results[group]["L>=1"]

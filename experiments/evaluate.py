@@ -55,8 +55,9 @@ class Command:
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote, in place of those of the run, or of the
     bundled ones."""
-    seed: int = 0
-    """Seed of sampled actions."""
+    seed: int | None = None
+    """Seed of sampled actions. By default the run's own, which gives the results that its training
+    ended with; 0 for the policies that need no checkpoint."""
     out: Path | None = None
     """Folder to write; must be new or empty. By default <checkpoint>/<policy> for one checkpoint,
     <checkpoint>/history-<policy> for its history, runs/<policy> without one."""
@@ -108,9 +109,8 @@ def default_folder(command: Command) -> Path:
 def untrained_config(command: Command) -> TrainConfig:
     """The task and seed of the policies that need no checkpoint."""
     split = command.split or TrainConfig().split
-    return TrainConfig(
-        split=split, validation=command.validation, data=command.data, seed=command.seed
-    )
+    seed = command.seed or 0
+    return TrainConfig(split=split, validation=command.validation, data=command.data, seed=seed)
 
 
 def evaluate_untrained(command: Command, folder: Path) -> None:
@@ -118,23 +118,25 @@ def evaluate_untrained(command: Command, folder: Path) -> None:
     from tdanet_jax import episodes, evaluation, policies, report
     from tdanet_jax.task import load_task
 
-    task = load_task(untrained_config(command))
+    config = untrained_config(command)
+    task = load_task(config)
     lists = episodes.load(task.tables, task.split, task.extras)
     make = {"random": policies.random, "shortest_path": policies.shortest_path}[command.policy]
-    played = evaluation.evaluate_lists(make(), None, task.eval_params, lists, command.seed)
+    played = evaluation.evaluate_lists(make(), None, task.eval_params, lists, config.seed)
     provenance = report.Provenance(
         split=task.split.name,
         model=command.policy,
         policy=command.policy,
         episodes_trained=0,
-        seed=command.seed,
+        seed=config.seed,
+        evaluation_seed=config.seed,
         steps=0,
         data_version=task.tables.data_version,
         data=command.data,
     )
     folder.mkdir(parents=True, exist_ok=True)
     print_summary(report.write(folder, provenance, task.tables, played))
-    console.print(f"wrote {folder / 'results.md'}")
+    console.print(f"wrote {folder / report.RESULTS_PAGE}")
 
 
 def evaluate_one(command: Command, network: Saved, folder: Path) -> None:
@@ -144,12 +146,12 @@ def evaluate_one(command: Command, network: Saved, folder: Path) -> None:
     done = next(saved.evaluate([network], command.policy == "greedy", command.seed))
     folder.mkdir(parents=True, exist_ok=True)
     print_summary(report.write(folder, done.provenance, done.task.tables, done.played))
-    console.print(f"wrote {folder / 'results.md'}")
+    console.print(f"wrote {folder / report.RESULTS_PAGE}")
 
 
 def evaluate_several(command: Command, networks: Sequence[Saved], folder: Path) -> None:
     """Several runs, or the history of one or more."""
-    from tdanet_jax import comparison, figures, report, saved
+    from tdanet_jax import comparison, figures, files, report, saved
 
     results, records = {}, []
     greedy = command.policy == "greedy"
@@ -160,22 +162,32 @@ def evaluate_several(command: Command, networks: Sequence[Saved], folder: Path) 
             records += [{**where, **row} for row in report.all_rows(done.task.tables, done.played)]
             show(len(results) / len(networks), f"{done.saved.run.name} {done.snapshot.updates:,}")
     ordered = [results[network] for network in networks]
-    names = [network.run.name for network in networks]
+    names = short_names(command.checkpoint)
+    page = comparison.markdown(
+        f"{len(networks)} checkpoints", ordered, [names[network.run] for network in networks]
+    )
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "episodes.jsonl").open("w") as file:
-        file.writelines(json.dumps(record) + "\n" for record in records)
-    (folder / "evaluations.json").write_text(json.dumps(ordered, indent=2) + "\n")
-    page = comparison.markdown(f"{len(networks)} checkpoints", ordered, names)
-    (folder / "evaluations.md").write_text(page)
+    report.write_rows(folder, records)
+    files.write_text(folder / "evaluations.md", page)
     if command.history:
         curves = [
-            comparison.curve(run.name, [[r for n, r in results.items() if n.run == run]])
-            for run in command.checkpoint
+            comparison.curve(name, [[r for n, r in results.items() if n.run == run]])
+            for run, name in names.items()
         ]
         figures.evaluated_curves(
             curves, "Test rooms, while training", folder / "learning_curve.png"
         )
+    files.write_text(folder / "evaluations.json", json.dumps(ordered, indent=2) + "\n")
     console.print(f"wrote {folder / 'evaluations.md'}")
+
+
+def short_names(runs: Sequence[Path]) -> dict[Path, str]:
+    """A name for each run: its folder's, or the whole path where two are called alike."""
+    last = [run.resolve().name for run in runs]
+    return {
+        run: name if last.count(name) == 1 else str(run)
+        for run, name in zip(runs, last, strict=True)
+    }
 
 
 if __name__ == "__main__":

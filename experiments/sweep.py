@@ -14,7 +14,8 @@ import dataclasses
 import json
 import os
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,8 +42,8 @@ if TYPE_CHECKING:
 
 #: Batches whose inference time is reported.
 BATCHES = (1, 1024)
-#: Seed of the sampled actions with which histories are evaluated.
-EVALUATION_SEED = 0
+#: Seed of the random actions that runs are compared with.
+UNTRAINED_SEED = 0
 #: Exit statuses above this one mean that a signal stopped the program.
 SIGNALLED = 128
 #: Flags of the training command that a sweep sets itself.
@@ -100,11 +101,14 @@ def main(arguments: list[str] | None = None) -> None:
             fail("a sweep is one process; JAX_COORDINATOR_ADDRESS is set")
         check_positive(devices=training.devices)
         included = [sweep.finished(folder) for folder in command.include]
+        planned = [] if command.report_only else [command.out / sweep.run_name(c) for c in configs]
+        # What cannot stand in one report shows at once, not after hours of training.
+        check_alike([*sweep.find(command.out), *included], planned)
         try:
             if not command.report_only:
                 train_all(command, training, configs)
             with stoppable(lambda: "what is evaluated is kept"):
-                write_report(command.out, [*sweep.find(command.out), *included])
+                write_report(command.out, included)
         except SystemExit as stop:
             if isinstance(stop.code, int) and stop.code > SIGNALLED:
                 console.print("the sweep goes on with the same command")
@@ -189,23 +193,39 @@ def learn_together(runs: Sequence[Run], stop: StopRequest) -> None:
         save()
 
 
-def write_report(out: Path, runs: Sequence[Finished]) -> None:
-    """Evaluates what is missing, and writes the report."""
+@contextlib.contextmanager
+def alone(out: Path) -> Iterator[None]:
+    """Inside, no other process reports in `out`; waits for one that does."""
+    from tdanet_jax import files
+
+    with contextlib.ExitStack() as locks:
+        try:
+            locks.enter_context(files.locked(out))
+        except BlockingIOError:
+            console.print(f"{out}: another process reports; waiting for it ...")
+            locks.enter_context(files.locked(out, wait=True))
+        yield
+
+
+def write_report(out: Path, included: Sequence[Finished]) -> None:
+    """Evaluates what is missing, and writes the report on the runs in `out` and on others."""
     from tdanet_jax import figures, files, measure, report
 
-    if not runs:
+    if not (sweep.find(out) or included):
         fail(f"{out}: no finished run")
-    check_alike(runs)
-    out.mkdir(parents=True, exist_ok=True)
-    with files.locked(out):
+    for folder in sweep.find_others(out):
+        warnings.warn(f"{folder}: no run (it has no {CONFIG_FILE}); left out", stacklevel=2)
+    with alone(out):
+        runs = [*sweep.find(out), *included]  # another process may have finished some meanwhile
+        check_alike(runs)
         with reporter("histories") as show:
-            for run, points in sweep.histories(runs, out, EVALUATION_SEED):
+            for run, points in sweep.histories(runs, out):
                 show(points / max(run.config.history, points), run.folder.name)
         curves = sweep.make_curves(runs, out)
         console.print("measuring inference ...")
         found = sweep.Report(
             runs=runs,
-            untrained=sweep.untrained(runs, EVALUATION_SEED),
+            untrained=sweep.untrained(runs, UNTRAINED_SEED),
             costs=costs(runs),
             curves=curves,
             machine=measure.processor(),
@@ -219,9 +239,10 @@ def write_report(out: Path, runs: Sequence[Finished]) -> None:
     console.print(f"wrote {out / 'report.md'}")
 
 
-def check_alike(runs: Sequence[Finished]) -> None:
-    """Fails if the runs cannot stand in one table."""
-    names = [run.folder.name for run in runs]
+def check_alike(runs: Sequence[Finished], planned: Sequence[Path] = ()) -> None:
+    """Fails if the runs, and those in folders where they will be, cannot stand in one table."""
+    folders = [run.folder for run in runs]
+    names = [folder.name for folder in (*folders, *(set(planned) - set(folders)))]
     for name in names:
         if names.count(name) > 1:
             fail(f"two runs are called {name}: rename one of the folders")
@@ -231,19 +252,24 @@ def check_alike(runs: Sequence[Finished]) -> None:
 
 
 def costs(runs: Sequence[Finished]) -> dict[str, Cost]:
-    """Parameters and inference time of every model among the runs, on this machine."""
+    """Parameters and inference time of every network among the runs, on this machine, by label."""
     from tdanet_jax import measure
     from tdanet_jax.task import load_task
 
+    measured: dict[object, Cost] = {}
     out: dict[str, Cost] = {}
-    for run in runs:
-        if run.config.model not in out:
-            task = load_task(run.config)
+    for label, run in zip(sweep.labels(runs), runs, strict=True):
+        config = run.config
+        network = config.model, config.network, config.data, config.word_vectors
+        if network not in measured:
+            task = load_task(config)
             rows = {batch: measure.decision_row(task, batch, repeats=5) for batch in BATCHES}
-            out[run.config.model] = Cost(
+            measured[network] = Cost(
+                model=config.model,
                 parameters=rows[BATCHES[0]]["parameters"],
                 milliseconds={batch: row["milliseconds"] for batch, row in rows.items()},
             )
+        out.setdefault(label, measured[network])
     return out
 
 

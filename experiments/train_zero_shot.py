@@ -276,6 +276,7 @@ def report_on(run: Run, lists: Mapping[str, Episodes]) -> None:
         policy="sample",
         episodes_trained=int(run.state.episodes),
         seed=seed,
+        evaluation_seed=seed,
         steps=run.steps,
         data_version=task.tables.data_version,
         data=run.config.data,

@@ -1,21 +1,27 @@
 """Results of several networks side by side: rows of runs, means over seeds, learning curves.
 
 A result is the content of a `results.json`, a plain dictionary; `saved.Evaluated.results` adds
-where in its run the network was.
+where in its run the network was, and the run's settings.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from tdanet_jax import paper
+from tdanet_jax.config import TrainConfig
 from tdanet_jax.metrics import BUCKETS
+from tdanet_jax.vocabulary import GROUPS
 
 Result = Mapping[str, Any]
-GROUPS = ("seen", "unseen")
 MEASURES = ("SR", "SPL")
+#: Flags that make no other agent: the seed, which distinguishes repetitions, and what only says
+#: how often something is looked at or kept.
+NOT_SETTINGS = ("--seed", "--chunk-updates", "--checkpoint-minutes", "--history", "--max-skipped")
 
 
 class Spread(NamedTuple):
@@ -28,22 +34,72 @@ class Spread(NamedTuple):
         return f"{self.mean:.1f}" if self.sd is None else f"{self.mean:.1f} ± {self.sd:.1f}"
 
 
-class Key(NamedTuple):
-    """What results differ in that are no repetitions of one another."""
+def flags(config: TrainConfig) -> dict[str, Any]:
+    """A configuration's values by flag: --num-envs 256."""
+    return dict(_flags(dataclasses.asdict(config)))
 
-    split: str
+
+def _flags(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flags(value)
+        else:
+            yield f"--{name.replace('_', '-')}", value
+
+
+def settings(config: TrainConfig) -> dict[str, Any]:
+    """The flags in which repetitions of a run must agree."""
+    return {flag: value for flag, value in flags(config).items() if flag not in NOT_SETTINGS}
+
+
+class _Kind(NamedTuple):
+    """What repetitions of a run agree in."""
+
     model: str
-    policy: str
-    data_version: str
+    split: str
+    values: tuple[tuple[str, Any], ...]  # by flag, where there is one
 
 
-def by_key(results: Iterable[Result]) -> dict[Key, list[Result]]:
-    """Results of equal split, model, policy and rooms together: one for each seed."""
-    out: dict[Key, list[Result]] = {}
-    for result in results:
-        key = Key(*(result[name] for name in Key._fields))
-        out.setdefault(key, []).append(result)
+def _kind(result: Result) -> _Kind:
+    values = {
+        **result.get("settings", {}),
+        "--policy": result["policy"],
+        "scene tables": result["data_version"],
+    }
+    for flag in ("--model", "--split", "--validation"):  # the model and the split say these
+        values.pop(flag, None)
+    return _Kind(result["model"], result["split"], tuple(values.items()))
+
+
+def labels(results: Sequence[Result], names: Sequence[str]) -> list[str]:
+    """A label for each result: the same for those that differ in the seed alone.
+
+    It is the model's name and the values in which the results of that model differ. Results that
+    repeat a seed are no sample of seeds: each has its name behind the label.
+
+    Args:
+      results: with their runs' `settings`; without any where nothing was trained.
+      names: one for each result; points of one run share one.
+    """
+    kinds = [_kind(result) for result in results]
+    counts = Counter((kind, result["seed"]) for kind, result in zip(kinds, results, strict=True))
+    repeated = {kind for (kind, _), count in counts.items() if count > 1}
+    out = []
+    for kind, name in zip(kinds, names, strict=True):
+        rivals = [dict(other.values) for other in kinds if other.model == kind.model]
+        differing = [
+            _shown(flag, value)
+            for flag, value in kind.values
+            if any(rival.get(flag) != value for rival in rivals)
+        ]
+        out.append(", ".join([kind.model, *differing, *([name] if kind in repeated else [])]))
     return out
+
+
+def _shown(flag: str, value: Any) -> str:
+    if value is None or value is False:
+        return f"no {flag}"
+    return flag if value is True else f"{flag} {value}"
 
 
 def spread(values: Iterable[float | None]) -> Spread | None:
@@ -126,31 +182,40 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
 
     Args:
       results: as `saved.Evaluated.results` gives them.
-      runs: a short name for each.
+      runs: a short name for each; points of one run, which have no mean, share one.
     """
     lines = [f"# {title}", "", "SR and SPL in percent, test rooms."]
     for split in dict.fromkeys(result["split"] for result in results):
-        own = [
-            (result, run) for result, run in zip(results, runs, strict=True)
-            if result["split"] == split
-        ]  # fmt: skip
-        rows = [
+        own = [result for result in results if result["split"] == split]
+        names = [run for run, r in zip(runs, results, strict=True) if r["split"] == split]
+        rows: list[_Row] = [
             ((run, f"{r['updates']:,}", f"{r['episodes_trained']:,}", r["policy"]), r)
-            for r, run in own
+            for run, r in zip(names, own, strict=True)
         ]
-        if len({run for _, run in own}) == len(own):
-            for key, members in by_key(result for result, _ in own).items():
-                if len(members) > 1:
-                    mean = f"**{key.model}, {len(members)} seeds**"
-                    rows.append(((mean, "", "", key.policy), summary(members)))
+        rows += _means(own, names)
         for agent, groups in paper_rows(split).items():
             rows.append(((f"{agent} (paper)", "", "", ""), groups))
         lines += ["", f"## Split {split}", ""]
         lines += table(("Agent", "Updates", "Training episodes", "Actions"), rows)
         if paper_rows(split):
-            worlds = dict.fromkeys(paper.worlds(result["data"]) for result, _ in own)
+            worlds = dict.fromkeys(paper.worlds(result["data"]) for result in own)
             lines += ["", *worlds]
     return "\n".join(lines) + "\n"
+
+
+_Row = tuple[Sequence[str], Mapping[str, Any]]
+
+
+def _means(results: Sequence[Result], names: Sequence[str]) -> Iterator[_Row]:
+    """A row for every label that several seeds share; none among the points of histories."""
+    if len(set(names)) < len(names):
+        return
+    together: dict[str, list[Result]] = {}
+    for label, result in zip(labels(results, names), results, strict=True):
+        together.setdefault(label, []).append(result)
+    for label, seeds in together.items():
+        if len(seeds) > 1:
+            yield (f"**{label}, {len(seeds)} seeds**", "", "", seeds[0]["policy"]), summary(seeds)
 
 
 class Curve(NamedTuple):
@@ -166,9 +231,9 @@ def curve(label: str, runs: Sequence[Sequence[Result]]) -> Curve:
 
     Only the points of the budget that every seed has are taken.
     """
-    by_point = [{result["point"]: result for result in run} for run in runs]
-    shared = sorted(set.intersection(*(set(points) for points in by_point)))
-    at = [[points[point] for points in by_point] for point in shared]
+    by_share = [{result["share"]: result for result in run} for run in runs]
+    common = sorted(set.intersection(*(set(points) for points in by_share)))
+    at = [[points[share] for points in by_share] for share in common]
     return Curve(
         label=label,
         episodes=[statistics.fmean(r["episodes_trained"] for r in seeds) for seeds in at],

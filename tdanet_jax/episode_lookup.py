@@ -14,10 +14,9 @@ import numpy as np
 from tdanet_jax import episodes
 from tdanet_jax.env import POSES_PER_POSITION
 from tdanet_jax.episodes import Episodes
+from tdanet_jax.report import EPISODES_FILE
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
-
-EPISODES_FILE = "episodes.jsonl"
 
 
 class Start(NamedTuple):

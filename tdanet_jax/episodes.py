@@ -12,11 +12,10 @@ from tdanet_jax import assets
 from tdanet_jax.env import POSES_PER_POSITION, ROTATIONS
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.vocabulary import ROOM_TYPES, UNSEEN, Split, make_split
+from tdanet_jax.vocabulary import GROUPS, ROOM_TYPES, UNSEEN, Split, make_split
 
 ASSET = "episodes.npz"
 EPISODES_PER_ROOM_TYPE = 250
-GROUPS = ("seen", "unseen")
 #: Seed of the lists; they change only with the tables.
 LIST_SEED = 20240413
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -60,34 +60,34 @@ def evaluate_stacked(
     weights: Any,
     params: EnvParams,
     lists: Mapping[str, Episodes],
-    seed: int,
+    seed: int | Sequence[int],
     batched: bool | None = None,
 ) -> list[dict[str, tuple[Episodes, Records]]]:
     """`evaluate_lists` of W networks in one compiled call a list.
 
     Args:
       weights: parameters stacked, each leaf [W, ...].
+      seed: of all, or one for each [W].
       batched: whether the networks play side by side or one after the other. None does what is
         faster: side by side on an accelerator; on a processor, whose products are large enough
         already, one after the other.
 
     Returns:
-      What `evaluate_lists` gives for each network. Each meets the same random streams.
+      What `evaluate_lists` gives for each network. Equal seeds, equal random streams.
     """
     if batched is None:
         batched = jax.default_backend() != "cpu"
     limit = int(np.max(np.asarray(params.step_limit)))
-    key = jax.random.key(seed)
+    count = len(jax.tree.leaves(weights)[0])
+    key = jax.vmap(jax.random.key)(np.broadcast_to(np.asarray(seed, np.uint32), count))
     out: dict[str, list[Records]] = {}
     for i, (group, chosen) in enumerate(lists.items()):
         pose, target = jnp.asarray(chosen.pose), jnp.asarray(chosen.target)
+        own = jax.vmap(jax.random.fold_in, (0, None))(key, i)
         played = jax.device_get(
-            _play_each(
-                policy, limit, batched, weights, params, pose, target, jax.random.fold_in(key, i)
-            )
+            _play_each(policy, limit, batched, weights, params, pose, target, own)
         )
         out[group] = [Records(*one) for one in zip(*played, strict=True)]
-    count = len(jax.tree.leaves(weights)[0])
     return [{group: (lists[group], out[group][w]) for group in lists} for w in range(count)]
 
 
@@ -102,11 +102,13 @@ def _play_each(
     target: jax.Array,
     key: jax.Array,
 ) -> tuple[jax.Array, ...]:
-    def play(one: Any) -> tuple[jax.Array, ...]:
-        out: tuple[jax.Array, ...] = _play(policy, limit, one, params, pose, target, key)
+    def play(one: tuple[Any, jax.Array]) -> tuple[jax.Array, ...]:
+        own, stream = one
+        out: tuple[jax.Array, ...] = _play(policy, limit, own, params, pose, target, stream)
         return out
 
-    return jax.vmap(play)(weights) if batched else jax.lax.map(play, weights)
+    each = weights, key
+    return jax.vmap(play)(each) if batched else jax.lax.map(play, each)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

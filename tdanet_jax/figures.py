@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from tdanet_jax import files
-from tdanet_jax.comparison import GROUPS, MEASURES, Curve
+from tdanet_jax.comparison import MEASURES, Curve
+from tdanet_jax.vocabulary import GROUPS
 
 #: Colours (Okabe and Ito) that stay apart for the colour-blind and, with the dashes, in grey.
 BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"

@@ -93,6 +93,19 @@ def read(path: Path) -> Snapshot:
     return Snapshot(weights=traverse_util.unflatten_dict(content, sep="/"), **where)
 
 
+def checksums(path: Path) -> list[tuple[str, int]]:
+    """Name and checksum (CRC-32) of every array of a point, from the file's directory alone.
+
+    Raises:
+      ValueError: the file is missing or damaged; the message names it.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return [(entry.filename, entry.CRC) for entry in archive.infolist()]
+    except (OSError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: unreadable ({error})") from error
+
+
 def points(run: Path) -> list[Path]:
     """The files of a run's history, oldest first."""
     return sorted(path for path in (run / FOLDER).glob(f"*{SUFFIX}") if path.stem.isdecimal())

@@ -6,7 +6,7 @@ import dataclasses
 import importlib.resources
 import json
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,11 @@ from tdanet_jax.episodes import Episodes
 from tdanet_jax.evaluation import Records
 from tdanet_jax.metrics import BUCKETS, grouped, summarise
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS, ROOM_TYPES
+from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS, GROUPS, ROOM_TYPES
 
 RESULTS_VERSION = 1
+#: What an evaluation writes into its folder; `RESULTS_FILE` comes last.
+RESULTS_FILE, RESULTS_PAGE, EPISODES_FILE = "results.json", "results.md", "episodes.jsonl"
 
 #: Unseen classes that have a near-synonym among the classes known in training.
 NEAR_SYNONYMS = {
@@ -31,13 +33,25 @@ NEAR_SYNONYMS = {
 
 @dataclasses.dataclass(frozen=True)
 class Provenance:
-    """Where a result comes from; the fields of `results.json` that are not numbers of it."""
+    """Where a result comes from; the fields of `results.json` that are not numbers of it.
+
+    Attributes:
+      split, model: what was trained.
+      policy: how actions were chosen.
+      episodes_trained, steps: training episodes and environment steps.
+      seed: of the training; of policies without training, that of the evaluation.
+      evaluation_seed: with which actions were sampled in the test episodes.
+      data_version: of the scene tables that it was evaluated on.
+      data: file of their rooms, where they are not the bundled ones.
+      image: what the model sees, if it looks at an image.
+    """
 
     split: str
     model: str
     policy: str
     episodes_trained: int
     seed: int
+    evaluation_seed: int
     steps: int
     data_version: str
     data: str | None = None
@@ -74,16 +88,14 @@ def results(provenance: Provenance, groups: Mapping[str, Mapping[str, np.ndarray
             for name in found
         }
 
+    origin = dataclasses.asdict(provenance)
     return {
         "version": RESULTS_VERSION,
-        **{k: v for k, v in dataclasses.asdict(provenance).items() if k in _HEAD},
-        "seen": _summary(groups["seen"]),
-        "unseen": _summary(groups["unseen"]) if "unseen" in groups else None,
+        **{name: origin.pop(name) for name in _HEAD},
+        **{name: _summary(groups[name]) if name in groups else None for name in GROUPS},
         "by_room": by("room", ROOM_TYPES),
         "by_target": by("target", ALL_TARGETS),
-        "seed": provenance.seed,
-        "steps": provenance.steps,
-        "data_version": provenance.data_version,
+        **origin,
         "commit": code_version(),
     }
 
@@ -92,6 +104,7 @@ def _summary(column: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     return summarise(*(column[name] for name in ("success", "shortest", "length", "cluster")))
 
 
+#: What `results.json` begins with.
 _HEAD = ("split", "model", "policy", "episodes_trained")
 
 
@@ -137,14 +150,17 @@ def write(
     """Writes `results.json`, `results.md` and `episodes.jsonl`; returns the results."""
     groups = {name: columns(tables, *pair) for name, pair in played.items()}
     out = results(provenance, groups)
-    with files.replacing(folder / "episodes.jsonl") as fresh, fresh.open("w") as file:
-        file.writelines(json.dumps(row) + "\n" for row in all_rows(tables, played))
-    files.write_text(
-        folder / "results.md", markdown(out, groups, provenance.data, provenance.image)
-    )
+    write_rows(folder, all_rows(tables, played))
+    files.write_text(folder / RESULTS_PAGE, markdown(out, groups))
     # The last file, and whole: where it is, the others are.
-    files.write_text(folder / "results.json", json.dumps(out, indent=2) + "\n")
+    files.write_text(folder / RESULTS_FILE, json.dumps(out, indent=2) + "\n")
     return out
+
+
+def write_rows(folder: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Writes `episodes.jsonl`."""
+    with files.replacing(folder / EPISODES_FILE) as fresh, fresh.open("w") as file:
+        file.writelines(json.dumps(row) + "\n" for row in rows)
 
 
 def all_rows(
@@ -155,36 +171,27 @@ def all_rows(
         yield from episode_rows(name, columns(tables, episodes, records), records)
 
 
-def markdown(
-    out: Mapping[str, Any],
-    groups: Mapping[str, Mapping[str, np.ndarray]],
-    data: str | None = None,
-    image: str | None = None,
-) -> str:
-    """`results.md`: the tables of the paper's form, with the paper's rows beside ours.
-
-    Args:
-      data: file of the rooms, where they are not the bundled ones.
-      image: what the model sees, if it looks at an image.
-    """
+def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarray]]) -> str:
+    """`results.md`: the tables of the paper's form, with the paper's rows beside ours."""
     lines = [
         f"# {out['model']}, split {out['split']}, seed {out['seed']}",
         "",
         f"{out['episodes_trained']:,} training episodes, {out['steps']:,} environment steps; "
-        f"{out['policy']} actions; scene tables {out['data_version']}, code {out['commit']}.",
-        *([] if image is None else [f"Image: {image}."]),
+        f"{out['policy']} actions, evaluation seed {out['evaluation_seed']}; scene tables "
+        f"{out['data_version']}, code {out['commit']}.",
+        *(f"{name.capitalize()}: {out[name]}." for name in ("data", "image") if out[name]),
         "",
         "SR and SPL in percent, with 95 % bootstrap intervals over (room, target) pairs.",
         "",
         *_header("Targets", "Agent"),
     ]
-    for group in ("seen", "unseen"):
+    for group in GROUPS:
         if out[group] is None:
             continue
         lines.append(_row((group, f"**{out['model']} (ours)**"), out[group]))
         lines += [_paper_row(group, *row) for row in paper.rates(out["split"], group)]
     if any(rate.split == out["split"] for rate in paper.RATES):
-        lines += ["", paper.worlds(data)]
+        lines += ["", paper.worlds(out["data"])]
     if "unseen" in groups and (apart := _near_synonyms(groups["unseen"])):
         known = "; ".join(f"{name}: {', '.join(like)}" for name, like in NEAR_SYNONYMS.items())
         lines += ["", f"Unseen classes with a near-synonym known in training ({known}) apart:"]

@@ -13,7 +13,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from tdanet_jax import classes, episodes, evaluation, history, policies, report
+from tdanet_jax import classes, comparison, episodes, evaluation, history, policies, report
 from tdanet_jax import config as configs
 from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
@@ -34,15 +34,20 @@ class Saved:
 
     Attributes:
       run: its run's folder.
-      config: its run's configuration, or with other rooms to be evaluated in.
+      config: its run's configuration.
       point: a file of the run's history, or None for the newest checkpoint.
-      other_rooms: the rooms are not those of its training.
+      data: file of rooms to evaluate in; None for those of its training.
     """
 
     run: Path
     config: TrainConfig
     point: Path | None = None
-    other_rooms: bool = False
+    data: str | None = None
+
+    @property
+    def rooms(self) -> str | None:
+        """File of the rooms that it is evaluated in; None for the bundled ones."""
+        return self.config.data if self.data is None else self.data
 
     def load(self) -> Snapshot:
         """Reads it. Raises ValueError if it cannot be read."""
@@ -68,17 +73,19 @@ class Evaluated:
     played: Played
 
     def results(self) -> dict:
-        """The content of a `results.json`, after the run's folder and where the run was."""
+        """The content of a `results.json`, after the run's folder and where the run was; the run's
+        settings behind it."""
         groups = {
             name: report.columns(self.task.tables, *pair) for name, pair in self.played.items()
         }
         return {
             "run": str(self.saved.run),
-            "data": self.provenance.data,
             "point": self.snapshot.point,
+            "share": self.snapshot.point / max(self.saved.config.history, 1),
             "updates": self.snapshot.updates,
             "training_seconds": round(self.snapshot.seconds, 1),
             **report.results(self.provenance, groups),
+            "settings": comparison.settings(self.saved.config),
         }
 
 
@@ -92,25 +99,28 @@ def find(run: Path, with_history: bool = False, data: str | None = None) -> list
       ValueError: the folder holds no run, or none of its networks.
     """
     config = configs.load(run / CONFIG_FILE)
-    if data is not None:
-        config = dataclasses.replace(config, data=data)
     points: list[Path | None] = [*history.points(run)] if with_history else [None]
     if with_history and not points:
         raise ValueError(f"{run / history.FOLDER}: no history; train with --history above 0")
     if not with_history and Checkpoints(run).latest() is None:
         raise ValueError(f"{run}: no checkpoint")
-    return [Saved(run, config, point, data is not None) for point in points]
+    return [Saved(run, config, point, data) for point in points]
 
 
-def evaluate(networks: Sequence[Saved], greedy: bool, seed: int) -> Iterator[Evaluated]:
+def evaluate(
+    networks: Sequence[Saved], greedy: bool, seed: int | None = None
+) -> Iterator[Evaluated]:
     """Plays the fixed test episodes with every network; those of one task come together.
+
+    Args:
+      seed: of sampled actions; None takes each run's own, as its training does at its end.
 
     Raises:
       ValueError: a network cannot be read, or was trained on other scene tables.
     """
     groups: dict[TrainConfig, list[Saved]] = {}
     for network in networks:
-        groups.setdefault(_task_config(network.config), []).append(network)
+        groups.setdefault(_task_config(network), []).append(network)
     for config, members in groups.items():
         task = load_task(config)
         lists = episodes.load(task.tables, task.split, task.extras)
@@ -121,30 +131,32 @@ def evaluate(networks: Sequence[Saved], greedy: bool, seed: int) -> Iterator[Eva
             weights = jax.tree.map(
                 lambda *leaves: jnp.stack(leaves), *(s.weights for s in snapshots)
             )
-            played = evaluation.evaluate_stacked(policy, weights, task.eval_params, lists, seed)
-            for network, snapshot, own in zip(part, snapshots, played, strict=True):
+            seeds = [network.config.seed if seed is None else seed for network in part]
+            played = evaluation.evaluate_stacked(policy, weights, task.eval_params, lists, seeds)
+            for network, snapshot, own, drawn in zip(part, snapshots, played, seeds, strict=True):
                 yield Evaluated(
                     saved=network,
                     snapshot=dataclasses.replace(snapshot, weights=None),
                     task=task,
-                    provenance=_provenance(network, snapshot, task, greedy),
+                    provenance=_provenance(network, snapshot, task, greedy, drawn),
                     played=own,
                 )
 
 
-def _task_config(config: TrainConfig) -> TrainConfig:
-    """The configuration with all that only training uses at its default."""
+def _task_config(network: Saved) -> TrainConfig:
+    """Its configuration in the rooms to evaluate in, all that only training uses at its default."""
     default = TrainConfig()
     names = (
         "steps", "episodes", "minutes", "seed", "chunk_updates", "checkpoint_minutes", "history",
         "max_skipped", "learner",
     )  # fmt: skip
-    return dataclasses.replace(config, **{name: getattr(default, name) for name in names})
+    unused = {name: getattr(default, name) for name in names}
+    return dataclasses.replace(network.config, data=network.rooms, **unused)
 
 
 def _checked(network: Saved, task: Task) -> Snapshot:
     snapshot = network.load()
-    if not network.other_rooms and snapshot.data_version != task.tables.data_version:
+    if network.data is None and snapshot.data_version != task.tables.data_version:
         raise ValueError(
             f"{network.point or network.run}: trained on scene tables {snapshot.data_version}, "
             f"these are {task.tables.data_version}"
@@ -153,15 +165,18 @@ def _checked(network: Saved, task: Task) -> Snapshot:
     return snapshot
 
 
-def _provenance(network: Saved, snapshot: Snapshot, task: Task, greedy: bool) -> report.Provenance:
+def _provenance(
+    network: Saved, snapshot: Snapshot, task: Task, greedy: bool, seed: int
+) -> report.Provenance:
     return report.Provenance(
         split=task.split.name,
         model=network.config.model,
         policy="greedy" if greedy else "sample",
         episodes_trained=snapshot.episodes,
         seed=network.config.seed,
+        evaluation_seed=seed,
         steps=snapshot.updates * network.config.steps_per_update,
         data_version=task.tables.data_version,
-        data=network.config.data,
+        data=network.rooms,
         image=task.image,
     )

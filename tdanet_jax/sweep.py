@@ -7,6 +7,7 @@ A run's folder tells how far it is: nothing yet, begun (there is a `config.json`
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +20,6 @@ from tdanet_jax.config import CONFIG_FILE, MODELS, TrainConfig
 from tdanet_jax.vocabulary import UNSEEN
 
 REPORT_VERSION = 1
-RESULTS_FILE = "results.json"
 #: Where the evaluated histories of a sweep's runs are kept.
 HISTORIES = "histories"
 #: The splits of the paper's tables.
@@ -65,26 +65,19 @@ def progress(folder: Path, config: TrainConfig) -> Literal["new", "begun", "fini
     Raises:
       ValueError: the folder holds a run of another configuration; the message names the flags.
     """
+    from tdanet_jax.report import RESULTS_FILE
+
     if not (folder / CONFIG_FILE).exists():
         return "new"
-    there = configs.to_json(configs.load(folder / CONFIG_FILE))
-    differing = sorted(_differing(configs.to_json(config), there))
+    there = comparison.flags(configs.load(folder / CONFIG_FILE))
+    ours = comparison.flags(config)
+    differing = sorted(flag for flag in ours if ours[flag] != there[flag])
     if differing:
         raise ValueError(
             f"{folder}: trained with other values of {', '.join(differing)}; "
             "choose another --out, or the flags of before"
         )
     return "finished" if (folder / RESULTS_FILE).exists() else "begun"
-
-
-def _differing(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> Iterator[str]:
-    """The flags in which two configurations differ."""
-    for name in ours.keys() | theirs.keys():
-        one, other = ours.get(name), theirs.get(name)
-        if isinstance(one, Mapping) and isinstance(other, Mapping):
-            yield from _differing(one, other)
-        elif one != other:
-            yield f"--{name.replace('_', '-')}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +87,7 @@ class Finished:
     Attributes:
       folder: where it is.
       config: what was trained.
-      results: the content of its `results.json`.
+      results: the content of its `results.json`, and its settings.
       seconds: training time; None if nothing says.
     """
 
@@ -110,29 +103,54 @@ def finished(folder: Path) -> Finished:
     Raises:
       ValueError: the folder holds none; the message names it.
     """
+    from tdanet_jax.report import RESULTS_FILE
     from tdanet_jax.training import METRICS_FILE, read_metrics
 
     config = configs.load(folder / CONFIG_FILE)
     path = folder / RESULTS_FILE
     try:
         results = json.loads(path.read_text())
-        results["by_room"], results["seen"]["L>=1"]
+        results["seen"]["L>=1"], *(results[name] for name in _READ)
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; the run is not finished") from None
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not the results of a run ({error})") from None
     rows = read_metrics(folder) if (folder / METRICS_FILE).exists() else []
+    results["settings"] = comparison.settings(config)
     return Finished(folder, config, results, rows[-1]["seconds"] if rows else None)
+
+
+#: What a report reads in a `results.json`, beside the rates of groups.
+_READ = (
+    "split", "model", "policy", "seed", "data_version", "episodes_trained", "steps", "by_room"
+)  # fmt: skip
 
 
 def find(out: Path) -> list[Finished]:
     """The finished runs in a sweep's folder, by name."""
-    return [finished(path.parent) for path in sorted(out.glob(f"*/{RESULTS_FILE}"))]
+    return [finished(path) for path in _with_results(out) if (path / CONFIG_FILE).exists()]
 
 
-def histories(runs: Sequence[Finished], out: Path, seed: int) -> Iterator[tuple[Finished, int]]:
+def find_others(out: Path) -> list[Path]:
+    """Folders of results there that are no runs, say of a policy without training."""
+    return [path for path in _with_results(out) if not (path / CONFIG_FILE).exists()]
+
+
+def _with_results(out: Path) -> list[Path]:
+    from tdanet_jax.report import RESULTS_FILE
+
+    return [path.parent for path in sorted(out.glob(f"*/{RESULTS_FILE}"))]
+
+
+def labels(runs: Sequence[Finished]) -> list[str]:
+    """What the report calls each run: those that differ in the seed alone share a name."""
+    return comparison.labels([run.results for run in runs], [run.folder.name for run in runs])
+
+
+def histories(runs: Sequence[Finished], out: Path) -> Iterator[tuple[Finished, int]]:
     """Evaluates the histories that are not evaluated yet, into `out`/histories/<run>.json.
 
+    Actions are sampled with each run's own seed: the end of its budget gives its results again.
     Yields a run and the points of it that are done, after each point.
 
     Raises:
@@ -146,30 +164,37 @@ def histories(runs: Sequence[Finished], out: Path, seed: int) -> Iterator[tuple[
             waiting[run.folder] = (run, saved.find(run.folder, with_history=True))
     done: dict[Path, list[Result]] = {folder: [] for folder in waiting}
     networks = [network for _, members in waiting.values() for network in members]
-    for one in saved.evaluate(networks, greedy=False, seed=seed):
+    for one in saved.evaluate(networks, greedy=False):
         folder = one.saved.run
         run, members = waiting[folder]
         done[folder].append(one.results())
         if len(done[folder]) == len(members):
             (out / HISTORIES).mkdir(exist_ok=True)
-            text = json.dumps(done[folder]) + "\n"
-            files.write_text(out / HISTORIES / f"{folder.name}.json", text)
+            kept = {"of": _fingerprint(run), "results": done[folder]}
+            files.write_text(out / HISTORIES / f"{folder.name}.json", json.dumps(kept) + "\n")
         yield run, len(done[folder])
 
 
 def evaluated_history(run: Finished, out: Path) -> list[Result] | None:
     """The results of a run's history, or None if it is not evaluated as it is now."""
-    from tdanet_jax import history
-
     path = out / HISTORIES / f"{run.folder.name}.json"
     if not path.exists():
         return None
     try:
-        results: list[Result] = json.loads(path.read_text())
-        updates = [result["updates"] for result in results]
-    except (json.JSONDecodeError, KeyError, TypeError):
+        kept = json.loads(path.read_text())
+        of, results = kept["of"], kept["results"]
+    except (ValueError, KeyError, TypeError):
         return None  # it is evaluated anew
-    return results if updates == [int(p.stem) for p in history.points(run.folder)] else None
+    return results if of == _fingerprint(run) else None
+
+
+def _fingerprint(run: Finished) -> str:
+    """Another one for another configuration, other rooms or other networks in its history."""
+    from tdanet_jax import history
+
+    points = {path.name: history.checksums(path) for path in history.points(run.folder)}
+    told = [configs.to_json(run.config), run.results["data_version"], points]
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 
 
 def untrained(runs: Sequence[Finished], seed: int) -> list[Result]:
@@ -185,7 +210,8 @@ def untrained(runs: Sequence[Finished], seed: int) -> list[Result]:
             played = evaluation.evaluate_lists(make(), None, task.eval_params, lists, seed)
             provenance = report.Provenance(
                 split=task.split.name, model=name, policy=name, episodes_trained=0, seed=seed,
-                steps=0, data_version=task.tables.data_version, data=config.data,
+                evaluation_seed=seed, steps=0, data_version=task.tables.data_version,
+                data=config.data,
             )  # fmt: skip
             groups = {group: report.columns(task.tables, *pair) for group, pair in played.items()}
             out.append(report.results(provenance, groups))
@@ -197,10 +223,12 @@ class Cost:
     """Size and speed of a model on this machine.
 
     Attributes:
+      model: its name.
       parameters: all trained numbers; word vectors are not among them.
       milliseconds: of one decision for a batch of so many agents.
     """
 
+    model: str
     parameters: int
     milliseconds: Mapping[int, float]
 
@@ -212,7 +240,7 @@ class Report:
     Attributes:
       runs: the finished runs.
       untrained: results of policies that need no training, one for each split and policy.
-      costs: by model.
+      costs: by the runs' labels.
       curves: learning curves by split.
       machine: where the costs were measured.
       code: the version of the code.
@@ -232,34 +260,33 @@ class Report:
         return [name for name in UNSEEN if name in names] + sorted(names - set(UNSEEN))
 
     def results(self, split: str) -> dict[str, list[Result]]:
-        """Results by model on a split: those without training, then in the order of MODELS."""
+        """Results on a split by label: those without training, then in the order of MODELS."""
+        named = [(result["model"], result) for result in self.untrained]
+        named += zip(labels(self.runs), (run.results for run in self.runs), strict=True)
         found: dict[str, list[Result]] = {}
-        for result in (*self.untrained, *(run.results for run in self.runs)):
+        for label, result in sorted(named, key=lambda pair: _place(pair[1]["model"])):
             if result["split"] == split:
-                found.setdefault(result["model"], []).append(result)
-        order = ["random", "shortest_path", *MODELS]
-        return dict(sorted(found.items(), key=lambda item: _place(order, item[0])))
+                found.setdefault(label, []).append(result)
+        return found
 
 
-def _place(order: Sequence[str], name: str) -> tuple[int, str]:
-    return (order.index(name) if name in order else len(order), name)
+def _place(model: str) -> tuple[int, str]:
+    """Sorts models: those without training, then in the order of MODELS, then by name."""
+    order = ["random", "shortest_path", *MODELS]
+    return (order.index(model) if model in order else len(order), model)
 
 
 def make_curves(runs: Sequence[Finished], out: Path) -> dict[str, list[Curve]]:
-    """Learning curves by split, one a model, from the evaluated histories."""
+    """Learning curves by split, one a label, from the evaluated histories."""
     found: dict[str, dict[str, list[list[Result]]]] = {}
-    for run in runs:
+    named = zip(labels(runs), runs, strict=True)
+    for label, run in sorted(named, key=lambda pair: _place(pair[1].config.model)):
         results = evaluated_history(run, out)
         if results:
-            by_model = found.setdefault(run.results["split"], {})
-            by_model.setdefault(run.results["model"], []).append(results)
-    order = list(MODELS)
+            found.setdefault(run.results["split"], {}).setdefault(label, []).append(results)
     return {
-        split: [
-            comparison.curve(model, models[model])
-            for model in sorted(models, key=lambda name: _place(order, name))
-        ]
-        for split, models in found.items()
+        split: [comparison.curve(label, seeds) for label, seeds in by_label.items()]
+        for split, by_label in found.items()
     }
 
 
@@ -271,14 +298,14 @@ def to_json(report: Report) -> dict[str, Any]:
         "machine": report.machine,
         "comparison": {
             split: {
-                model: _plain(comparison.summary(results))
-                for model, results in report.results(split).items()
+                label: _plain(comparison.summary(results))
+                for label, results in report.results(split).items()
             }
             for split in report.splits
         },
         "paper": [rate._asdict() for rate in paper.RATES],
         "paper_parameters_mebi": paper.PARAMETERS,
-        "costs": {model: dataclasses.asdict(cost) for model, cost in report.costs.items()},
+        "costs": {label: dataclasses.asdict(cost) for label, cost in report.costs.items()},
         "learning_curves": {
             split: {
                 curve.label: {
@@ -317,20 +344,21 @@ def left_out(report: Report) -> list[str]:
     """One line for each part of the paper's tables that nothing was trained for."""
     lines = []
     for split in PAPER_SPLITS:
-        absent = [model for model in MODELS if model not in report.results(split)]
+        trained = {run.config.model for run in report.runs if run.results["split"] == split}
+        absent = [model for model in MODELS if model not in trained]
         if len(absent) == len(MODELS):
             lines.append(f"Split {split}: nothing was trained.")
         elif absent:
             lines.append(f"Split {split}: not trained: {', '.join(absent)}.")
-    flat = [run.folder.name for run in report.runs if not _has_curve(report, run)]
+    drawn = {(split, curve.label) for split, curves in report.curves.items() for curve in curves}
+    flat = [
+        run.folder.name
+        for label, run in zip(labels(report.runs), report.runs, strict=True)
+        if (run.results["split"], label) not in drawn
+    ]
     if flat:
         lines.append(f"Learning curve: no history of {', '.join(flat)}.")
     return lines
-
-
-def _has_curve(report: Report, run: Finished) -> bool:
-    curves = report.curves.get(run.results["split"], ())
-    return any(curve.label == run.results["model"] for curve in curves)
 
 
 def markdown(report: Report, figures: Mapping[str, str]) -> str:
@@ -342,8 +370,8 @@ def markdown(report: Report, figures: Mapping[str, str]) -> str:
     lines = [
         f"# {len(report.runs)} runs",
         "",
-        f"SR and SPL in percent, test rooms, sampled actions; mean ± deviation over seeds. Code "
-        f"{report.code}.",
+        f"SR and SPL in percent, test rooms, sampled actions; mean ± deviation over seeds of one "
+        f"configuration. Code {report.code}.",
     ]
     for split in report.splits:
         lines += _comparison(report, split)
@@ -361,10 +389,10 @@ def markdown(report: Report, figures: Mapping[str, str]) -> str:
 def _comparison(report: Report, split: str) -> Iterator[str]:
     """The paper's comparison of models on one split, as a whole and by room type."""
     results = report.results(split)
-    summaries = {model: comparison.summary(members) for model, members in results.items()}
+    summaries = {label: comparison.summary(members) for label, members in results.items()}
     rows = [
-        ((f"{model} (ours)", str(len(out["seeds"])), _count(out["episodes_trained"])), out)
-        for model, out in summaries.items()
+        ((f"{label} (ours)", str(len(out["seeds"])), _count(out["episodes_trained"])), out)
+        for label, out in summaries.items()
     ]
     theirs = comparison.paper_rows(split)
     rows += [((f"{agent} (paper)", "", ""), groups) for agent, groups in theirs.items()]
@@ -380,12 +408,12 @@ def _comparison(report: Report, split: str) -> Iterator[str]:
 def _by_room(report: Report, split: str) -> Iterator[str]:
     """The same by room type; the shortest path scores 100 everywhere and is left out."""
     results = report.results(split)
-    summaries = {m: comparison.summary(r) for m, r in results.items() if m != "shortest_path"}
+    summaries = {k: comparison.summary(r) for k, r in results.items() if k != "shortest_path"}
     rooms = dict.fromkeys(room for out in summaries.values() for room in out["by_room"])
     rows = [
-        ((room, model), out["by_room"][room])
+        ((room, label), out["by_room"][room])
         for room in rooms
-        for model, out in summaries.items()
+        for label, out in summaries.items()
         if room in out["by_room"]
     ]
     yield from ("", f"### Split {split}, by room type", "")
@@ -399,12 +427,12 @@ def _ablations(report: Report) -> Iterator[str]:
     rows = []
     for split in report.splits:
         results = report.results(split)
-        found = [model for model in variants if model in results]
-        if len(found) > 1:
-            for model in found:
-                settings = MODELS[model][1]
-                parts = ["no" if settings.get(p) is False else "yes" for p in _ABLATED]
-                rows.append(((split, model, *parts), comparison.summary(results[model])))
+        models = {label: members[0]["model"] for label, members in results.items()}
+        if len(set(models.values()) & set(variants)) > 1:
+            for label in (label for label, model in models.items() if model in variants):
+                made_with = MODELS[models[label]][1]
+                parts = ["no" if made_with.get(p) is False else "yes" for p in _ABLATED]
+                rows.append(((split, label, *parts), comparison.summary(results[label])))
     if rows:
         yield from ("", "## Ablations (the paper's Tables IV and V)", "")
         yield from comparison.table(("Split", "Model", *_ABLATED.values()), rows)
@@ -425,11 +453,10 @@ def _costs(report: Report) -> Iterator[str]:
     ]
     yield from ("", "## Parameters and inference time", "")
     yield from (f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}")
-    for model in sorted(report.costs, key=lambda name: _place(list(MODELS), name)):
-        cost = report.costs[model]
-        published = paper.PARAMETERS.get(paper.NAMES.get(model, ""))
+    for label, cost in sorted(report.costs.items(), key=lambda item: _place(item[1].model)):
+        published = paper.PARAMETERS.get(paper.NAMES.get(cost.model, ""))
         cells = [
-            model,
+            label,
             f"{cost.parameters:,}",
             f"{cost.parameters / 2**20:.2f}",
             "-" if published is None else f"{published:.2f}",

@@ -51,6 +51,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
 }
 ALL_TARGETS = tuple(name for room in ROOM_TYPES for name in TARGETS[room])
 
+#: Groups of test episodes by their target: classes that training had as targets, and the others.
+GROUPS = ("seen", "unseen")
 #: Classes that are never a target in training, by split (seen/unseen) and room type.
 UNSEEN: dict[str, dict[str, tuple[str, ...]]] = {
     "22/0": dict.fromkeys(ROOM_TYPES, ()),

@@ -1,11 +1,13 @@
 """Several results side by side: means over seeds, tables, pages, curves."""
 
+import dataclasses
 import statistics
 
 import pytest
 
 from tdanet_jax import comparison, figures
 from tdanet_jax.comparison import Spread
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 
 
 def bucket(sr, spl):
@@ -22,6 +24,7 @@ def result(seed=0, sr=50.0, split="18/4", model="tdanet", point=0, unseen=True):
         "data": None, "data_version": "d", "split": split, "model": model, "policy": "sample",
         "seed": seed, "steps": 5120,
         "episodes_trained": 100 * (point + 1) + seed, "updates": 10 * point, "point": point,
+        "share": point / 20,
         **groups, "by_room": {"kitchen": shown},
     }  # fmt: skip
 
@@ -62,6 +65,80 @@ def test_a_page_without_rows_of_the_paper_does_not_speak_of_its_world():
 def test_a_history_is_not_averaged_over_its_points():
     page = comparison.markdown("Two", [result(point=0), result(point=1)], ["a", "a"])
     assert "seeds" not in page
+
+
+def of(seed=0, sr=50.0, **values):
+    """A result of a run with the given values in place of the defaults."""
+    config = TrainConfig(seed=seed, **values)
+    return {**result(seed, sr, model=config.model), "settings": comparison.settings(config)}
+
+
+def test_settings_are_the_flags_without_the_seed_and_what_only_looks_and_keeps():
+    config = TrainConfig(minutes=10.0, learner=LearnerConfig(num_envs=8))
+    found = comparison.settings(config)
+    assert (found["--minutes"], found["--num-envs"], found["--rows"]) == (10.0, 8, "object")
+    kept = dataclasses.replace(config, seed=3, history=0, chunk_updates=1, checkpoint_minutes=9.0)
+    assert comparison.settings(kept) == found
+    assert comparison.settings(dataclasses.replace(config, minutes=11.0)) != found
+
+
+def test_seeds_of_one_configuration_share_a_label():
+    results = [of(0), of(1), of(2) | {"steps": 9999}]  # the same minutes reach other steps
+    assert comparison.labels(results, "abc") == ["tdanet"] * 3
+
+
+def test_other_flags_are_another_configuration_and_are_said():
+    results = [
+        of(0), of(1, network=NetworkConfig(rows="class"), minutes=10.0),
+        of(2, learner=LearnerConfig(amsgrad=True)), of(3, model="ssnet"),
+    ]  # fmt: skip
+    assert comparison.labels(results, "abcd") == [
+        "tdanet, no --minutes, no --amsgrad, --rows object",
+        "tdanet, --minutes 10.0, no --amsgrad, --rows class",
+        "tdanet, no --minutes, --amsgrad, --rows object",
+        "ssnet",
+    ]
+    zero = comparison.labels([of(0), of(0, network=NetworkConfig(dropout=0.5))], "ab")
+    assert zero == ["tdanet, --dropout 0.0", "tdanet, --dropout 0.5"]
+
+
+def test_other_rooms_or_actions_are_apart():
+    results = [of(0), of(1) | {"data_version": "e"}]
+    assert comparison.labels(results, "ab") == ["tdanet, scene tables d", "tdanet, scene tables e"]
+    results = [of(0), of(1) | {"policy": "greedy"}]
+    assert comparison.labels(results, "ab") == [
+        "tdanet, --policy sample",
+        "tdanet, --policy greedy",
+    ]
+    results = [of(0), of(1) | {"split": "14/8"}]  # stand under headings of their own
+    assert comparison.labels(results, "ab") == ["tdanet", "tdanet"]
+
+
+def test_twice_the_same_seed_is_no_sample_of_seeds():
+    results = [of(0), of(1), of(0, 60.0)]
+    assert comparison.labels(results, "abc") == ["tdanet, a", "tdanet, b", "tdanet, c"]
+    page = comparison.markdown("Three", results, "abc")
+    assert "seeds**" not in page
+    assert "±" not in page
+
+
+def test_the_page_has_a_mean_for_every_configuration():
+    wide = {"network": NetworkConfig(width=16)}
+    results = [of(0, 70.0), of(1, 72.0), of(0, 30.0, **wide), of(1, 32.0, **wide)]
+    page = comparison.markdown("Four", results, "abcd")
+    assert "| **tdanet, --width 512, 2 seeds** |  |  | sample | 71.0 ± 1.4 |" in page
+    assert "| **tdanet, --width 16, 2 seeds** |  |  | sample | 31.0 ± 1.4 |" in page
+
+
+def test_results_of_before_have_no_settings_and_are_compared_by_the_rest():
+    assert comparison.labels([result(0), result(1)], "ab") == ["tdanet", "tdanet"]
+
+
+def test_a_curve_of_histories_of_other_lengths_meets_at_shares_of_the_budget():
+    ten = [result(0, 10.0 * k, point=k) | {"share": k / 10} for k in range(1, 11)]
+    twenty = [result(1, 5.0 * k, point=k) for k in range(1, 21)]
+    curve = comparison.curve("tdanet", [ten, twenty])
+    assert [point.mean for point in curve.values["seen", "SR"]] == [10.0 * k for k in range(1, 11)]
 
 
 def test_a_curve_has_the_points_that_all_seeds_share():

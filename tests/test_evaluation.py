@@ -253,10 +253,11 @@ def test_stacked_networks_play_as_each_of_them_alone(
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
     policy = policies.network(MODEL, words)
     lists = {"seen": drawn(rooms, 5), "unseen": drawn(rooms, 5, seed=1)}
-    together = evaluation.evaluate_stacked(policy, stacked, params, lists, 3, batched)
+    seeds = (3, 3, 2**32 - 1)
+    together = evaluation.evaluate_stacked(policy, stacked, params, lists, seeds, batched)
     assert len(together) == 3
-    for one, played in zip(several, together, strict=True):
-        alone = evaluation.evaluate_lists(policy, one, params, lists, 3)
+    for one, seed, played in zip(several, seeds, together, strict=True):
+        alone = evaluation.evaluate_lists(policy, one, params, lists, seed)
         for group, (chosen, records) in alone.items():
             assert played[group][0] is chosen
             for field in ("shortest", "length", "success", "actions"):

@@ -13,7 +13,7 @@ from tdanet_jax.vocabulary import ALL_TARGETS
 BUCKET = {"SR", "SPL", "SR_ci", "SPL_ci", "n"}
 TOP = [
     "version", "split", "model", "policy", "episodes_trained", "seen", "unseen", "by_room",
-    "by_target", "seed", "steps", "data_version", "commit",
+    "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "commit",
 ]  # fmt: skip
 
 
@@ -37,7 +37,7 @@ def played(ithor):
 
 @pytest.fixture
 def written(played, ithor, tmp_path):
-    provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 200, ithor.data_version)
+    provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 7, 200, ithor.data_version)
     return tmp_path, report.write(tmp_path, provenance, ithor, played)
 
 
@@ -52,10 +52,16 @@ def test_results_have_the_documented_shape(written):
     assert out["by_target"] == {"Mug": {"seen": out["seen"]}}
 
 
-def test_the_report_says_what_image_a_model_saw(played, ithor, tmp_path):
-    shown = report.Provenance("18/4", "savn", "sample", 1, 0, 2, ithor.data_version, image="a map")
-    report.write(tmp_path, shown, ithor, played)
-    assert "Image: a map." in (tmp_path / "results.md").read_text()
+def test_the_report_says_how_it_can_be_made_again(played, ithor, tmp_path):
+    shown = report.Provenance(
+        "18/4", "savn", "sample", 1, 0, 7, 2, ithor.data_version, "rooms.npz", "a map"
+    )
+    out = report.write(tmp_path, shown, ithor, played)
+    names = ("seed", "evaluation_seed", "data", "image")
+    assert [out[name] for name in names] == [0, 7, "rooms.npz", "a map"]
+    page = (tmp_path / "results.md").read_text()
+    assert "sample actions, evaluation seed 7;" in page
+    assert "\nData: rooms.npz.\nImage: a map.\n" in page
 
 
 def test_percentages_run_from_0_to_100_and_an_empty_bucket_is_null(written):
@@ -91,7 +97,7 @@ def test_unseen_classes_with_a_near_synonym_are_reported_apart(ithor, tmp_path):
     actions = np.full((2, 200), -1, np.int8)
     actions[:, :3] = [0, 0, 5]
     records = Records(np.array([3, 3]), np.array([3, 3]), np.array([True, False]), actions)
-    provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 200, ithor.data_version)
+    provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 7, 200, ithor.data_version)
     played = {"seen": (episodes, records), "unseen": (episodes, records)}
     report.write(tmp_path, provenance, ithor, played)
     page = (tmp_path / "results.md").read_text()

@@ -2,13 +2,15 @@
 
 import dataclasses
 import json
+import shutil
 
+import numpy as np
 import pytest
 
 from tdanet_jax import config as configs
-from tdanet_jax import history, sweep
+from tdanet_jax import history, saved, sweep
 from tdanet_jax.comparison import curve
-from tdanet_jax.config import MODELS, LearnerConfig, TrainConfig
+from tdanet_jax.config import MODELS, LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.history import Snapshot
 from tdanet_jax.sweep import Cost, Report
 from tests.test_comparison import result
@@ -78,20 +80,80 @@ def test_only_finished_runs_are_found_and_damaged_results_are_named(tmp_path):
         sweep.finished(tmp_path / sweep.run_name(BASE))
 
 
-def test_an_evaluated_history_counts_while_it_is_that_of_the_run(tmp_path):
+def keep_history(folder, weight=1.0, points=(1, 2)):
+    """Points of a history, of a network with one weight."""
+    for point in points:
+        weights = {"a": {"b": np.array([weight])}}
+        history.write(folder, Snapshot(weights, 10 * point, 100, 1.0, point, "d"))
+
+
+def evaluate_history(monkeypatch, run, out):
+    """`sweep.histories` of one run, with made-up results; True if it evaluated anything."""
+
+    class Played:
+        def __init__(self, network):
+            self.saved = network
+
+        def results(self):
+            return result(point=history.read(self.saved.point).point)
+
+    def play(networks, greedy):
+        return map(Played, networks)
+
+    monkeypatch.setattr(saved, "evaluate", play)
+    done = [points for _, points in sweep.histories([run], out)]
+    assert len(sweep.evaluated_history(run, out)) == 2
+    return done == [1, 2]
+
+
+def test_an_evaluated_history_counts_while_it_is_that_of_the_run(tmp_path, monkeypatch):
     folder = made(tmp_path, BASE, result())
     run = sweep.finished(folder)
     assert sweep.evaluated_history(run, tmp_path) is None
-    (tmp_path / "histories").mkdir()
+    keep_history(folder)
+    assert evaluate_history(monkeypatch, run, tmp_path)
+    assert not evaluate_history(monkeypatch, run, tmp_path)  # once is enough
     kept = tmp_path / "histories" / f"{folder.name}.json"
-    kept.write_text(json.dumps([result(point=1), result(point=2)]))
-    assert sweep.evaluated_history(run, tmp_path) is None  # the run has no such points
-    for point in (1, 2):
-        weights = {"a": {"b": [1.0]}}
-        history.write(folder, Snapshot(weights, 10 * point, 100, 1.0, point, "d"))
-    assert len(sweep.evaluated_history(run, tmp_path)) == 2
-    kept.write_text("[{")
+    for damaged in ("[{", "[]", "{}", json.dumps([result(point=1), result(point=2)])):
+        kept.write_text(damaged)
+        assert sweep.evaluated_history(run, tmp_path) is None
+    assert evaluate_history(monkeypatch, run, tmp_path)
+    keep_history(folder, points=(3,))
     assert sweep.evaluated_history(run, tmp_path) is None
+
+
+def test_the_history_of_a_run_that_was_trained_anew_is_evaluated_anew(tmp_path, monkeypatch):
+    """The same name and the same updates, but another configuration, network or rooms."""
+    run = sweep.finished(made(tmp_path, BASE, result()))
+    keep_history(run.folder)
+    assert evaluate_history(monkeypatch, run, tmp_path)
+    keep_history(run.folder, weight=2.0)  # of the same size
+    assert evaluate_history(monkeypatch, run, tmp_path)
+    other = dataclasses.replace(BASE, learner=LearnerConfig(learning_rate=1e-3))
+    shutil.rmtree(run.folder)
+    again = sweep.finished(made(tmp_path, other, result()))
+    assert again.folder == run.folder
+    keep_history(run.folder, weight=2.0)
+    assert evaluate_history(monkeypatch, again, tmp_path)
+    assert not evaluate_history(monkeypatch, again, tmp_path)
+    (run.folder / "results.json").write_text(json.dumps(result() | {"data_version": "e"}))
+    assert evaluate_history(monkeypatch, sweep.finished(run.folder), tmp_path)
+
+
+def test_a_copied_run_has_the_same_history(tmp_path, monkeypatch):
+    folder = made(tmp_path, BASE, result())
+    keep_history(folder)
+    assert evaluate_history(monkeypatch, sweep.finished(folder), tmp_path)
+    copy = shutil.copytree(folder, tmp_path / "elsewhere" / folder.name)
+    assert not evaluate_history(monkeypatch, sweep.finished(copy), tmp_path)
+
+
+def test_results_that_are_no_run_are_told_apart(tmp_path):
+    run = made(tmp_path, BASE, result())
+    (tmp_path / "random").mkdir()
+    (tmp_path / "random" / "results.json").write_text(json.dumps(result(model="random")))
+    assert [found.folder for found in sweep.find(tmp_path)] == [run]
+    assert sweep.find_others(tmp_path) == [tmp_path / "random"]
 
 
 @pytest.fixture
@@ -105,7 +167,7 @@ def report(tmp_path):
     return Report(
         runs=runs,
         untrained=[result(sr=11.0, model="random")],
-        costs={"tdanet": Cost(2_968_653, {1: 1.25, 1024: 10.5})},
+        costs={"tdanet": Cost("tdanet", 2_968_653, {1: 1.25, 1024: 10.5})},
         curves={"18/4": [curve("tdanet", points)]},
         machine="a machine",
         code="abc",
@@ -124,6 +186,50 @@ def test_the_page_holds_means_over_seeds_beside_the_paper(report):
     assert "| tdanet | 2,968,653 | 2.83 | 3.08 | 1.25 | 10.50 |" in page
     assert "on a machine" in page
     assert "| 18-4-tdanet-seed1 | 1 | 101 | 5,120 | - | 74.0 |" in page
+
+
+def test_runs_of_other_flags_or_of_the_same_seed_are_apart(tmp_path):
+    wide = dataclasses.replace(BASE, network=NetworkConfig(width=16))
+    runs = [
+        sweep.finished(made(tmp_path / name, config, result(config.seed, sr)))
+        for name, config, sr in (
+            ("a", BASE, 70.0), ("a", dataclasses.replace(BASE, seed=1), 74.0), ("wide", wide, 20.0)
+        )
+    ]  # fmt: skip
+    for run in runs:
+        keep_history(run.folder)
+    found = sweep.labels(runs)
+    assert found == ["tdanet, --width 512"] * 2 + ["tdanet, --width 16"]
+    costs = {label: Cost("tdanet", 1_048_576 * (1 + i), {1: 1.0}) for i, label in enumerate(found)}
+    report = Report(runs, [result(sr=11.0, model="random")], costs, {}, "a machine", "abc")
+    page = sweep.markdown(report, {})
+    assert "| tdanet, --width 512 (ours) | 2 | 100 | 72.0 ± 2.8 |" in page
+    assert "| tdanet, --width 16 (ours) | 1 | 100 | 20.0 |" in page
+    assert "| tdanet, --width 16 | 3,145,728 | 3.00 | 3.08 |" in page
+    assert "Split 18/4: not trained: tdanet-no-ta, " in page
+    assert list(report.results("18/4")) == ["random", *dict.fromkeys(found)]
+
+    again = sweep.finished(made(tmp_path / "again", BASE, result(0, 80.0)))
+    again = dataclasses.replace(again, folder=again.folder.rename(tmp_path / "again" / "again"))
+    assert sweep.labels([*runs[:2], again]) == [
+        "tdanet, 18-4-tdanet-seed0", "tdanet, 18-4-tdanet-seed1", "tdanet, again"
+    ]  # fmt: skip
+
+
+def test_there_is_a_curve_for_every_configuration(tmp_path, monkeypatch):
+    configs_ = [BASE, dataclasses.replace(BASE, seed=1), dataclasses.replace(BASE, minutes=5.0)]
+    runs = [
+        sweep.finished(made(tmp_path / str(i), config, result(config.seed)))
+        for i, config in enumerate(configs_)
+    ]
+    runs[2] = dataclasses.replace(runs[2], folder=runs[2].folder.rename(tmp_path / "2" / "other"))
+    for run in runs:
+        keep_history(run.folder)
+        evaluate_history(monkeypatch, run, tmp_path)
+    [first, second] = sweep.make_curves(runs, tmp_path)["18/4"]
+    assert (first.label, second.label) == ("tdanet, no --minutes", "tdanet, --minutes 5.0")
+    seeds = [curve.values["seen", "SR"][0].sd for curve in (first, second)]
+    assert seeds == [0.0, None]
 
 
 def test_what_was_not_trained_is_left_out_and_named(report):

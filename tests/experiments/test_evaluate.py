@@ -4,19 +4,25 @@ import dataclasses
 import json
 import os
 import shutil
+from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import pytest
 
 from experiments import evaluate
+from experiments.console import check_empty
 from tdanet_jax import config as configs
-from tdanet_jax import history
+from tdanet_jax import history, report, saved
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.history import Snapshot
+from tdanet_jax.saved import Saved
 from tdanet_jax.task import make_task
 from tests.experiments import command
+from tests.experiments.test_faults import full_disk
 from tests.models import samples
 from tests.test_agent import OLD_RUN
+from tests.test_comparison import result as made_up
 
 
 def test_the_shortest_path_policy_scores_100(ithor, tmp_path):
@@ -25,6 +31,7 @@ def test_the_shortest_path_policy_scores_100(ithor, tmp_path):
     done = command.run("evaluate", "--policy", "shortest_path", "--split", "14/8", "--out", out)
     assert done.returncode == 0, done.stderr
     results = json.loads((out / "results.json").read_text())
+    assert [results[name] for name in ("seed", "evaluation_seed", "data")] == [0, 0, None]
     for group in ("seen", "unseen"):
         assert results[group]["L>=1"]["SR"] == results[group]["L>=1"]["SPL"] == 100
         assert results[group]["L>=1"]["n"] == 1000
@@ -66,6 +73,8 @@ def test_the_history_of_two_runs_gives_a_curve_and_all_records(runs, few_episode
     places = [(os.path.basename(r["run"]), r["point"], r["episodes_trained"]) for r in found]
     assert places == [("seed0", 1, 100), ("seed0", 2, 200), ("seed1", 1, 100), ("seed1", 2, 200)]
     assert [r["steps"] for r in found] == [400, 800, 400, 800]  # 2 environments, 20 steps
+    assert [r["evaluation_seed"] for r in found] == [0, 0, 1, 1]  # each run's own
+    assert [r["settings"]["--num-envs"] for r in found] == [2] * 4
     records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
     assert len(records) == 4 * 200
     for result in found:
@@ -78,12 +87,13 @@ def test_the_history_of_two_runs_gives_a_curve_and_all_records(runs, few_episode
 
 def test_one_run_gives_the_files_of_a_single_result_beside_it(ithor, tmp_path):
     run = shutil.copytree(OLD_RUN, tmp_path / "run")
-    evaluate.main(["--checkpoint", str(run), "--policy", "greedy"])
+    evaluate.main(["--checkpoint", str(run), "--policy", "greedy", "--seed", "5"])
     assert {path.name for path in (run / "greedy").iterdir()} == {
         "results.json", "results.md", "episodes.jsonl"
     }  # fmt: skip
     out = json.loads((run / "greedy" / "results.json").read_text())
     assert [out[k] for k in ("policy", "seed", "steps", "episodes_trained")] == ["greedy", 0, 16, 1]
+    assert out["evaluation_seed"] == 5
 
 
 def test_a_run_is_evaluated_in_rooms_of_a_file(
@@ -93,6 +103,7 @@ def test_a_run_is_evaluated_in_rooms_of_a_file(
     evaluate.main(["--checkpoint", run, "--data", str(rooms_file), "--out", str(out)])
     results = json.loads((out / "results.json").read_text())
     assert results["data_version"] == some_rooms.data_version
+    assert results["data"] == str(rooms_file)
     records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
     assert len(records) == results["seen"]["L>=1"]["n"] + results["unseen"]["L>=1"]["n"] == 200
     # Of the file's rooms, those that are test rooms.
@@ -105,6 +116,34 @@ def test_a_run_is_evaluated_in_rooms_of_a_file(
         evaluate.main(["--checkpoint", run, "--out", str(tmp_path / "here")])
     assert f"{run}: trained on scene tables {some_rooms.data_version}" in capsys.readouterr().err
     assert not (tmp_path / "here").exists()
+
+
+def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch, capsys):
+    """Files appear whole or not at all: the same command works again."""
+
+    class Done:
+        saved = Saved(tmp_path / "a", TINY)
+        snapshot = SimpleNamespace(updates=10)
+        task = SimpleNamespace(tables=None)
+        played = None
+
+        def results(self):
+            return made_up()
+
+    monkeypatch.setattr(saved, "evaluate", lambda networks, greedy, seed: [Done()])
+    monkeypatch.setattr(report, "all_rows", lambda tables, played: 1000 * [{"group": "seen"}])
+    command, out = evaluate.Command(checkpoint=(tmp_path / "a",)), tmp_path / "out"
+    with pytest.raises(OSError, match="File too large"), full_disk(5000):
+        evaluate.evaluate_several(command, [Done.saved], out)
+    check_empty(out)
+    evaluate.evaluate_several(command, [Done.saved], out)
+    assert json.loads((out / "evaluations.json").read_text()) == [made_up()]
+    assert len((out / "episodes.jsonl").read_text().splitlines()) == 1000
+
+
+def test_runs_of_folders_that_are_called_alike_have_their_paths_for_names():
+    a, b, other = Path("x/run"), Path("y/run"), Path("x/other")
+    assert evaluate.short_names([a, b, other]) == {a: "x/run", b: "y/run", other: "other"}
 
 
 def test_a_run_without_history_is_named(runs, capsys, tmp_path):

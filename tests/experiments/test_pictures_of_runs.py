@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from experiments import attention, evaluate, replay, trajectories
+from experiments.one_episode import Choice
 from tdanet_jax import devices, episodes
 from tdanet_jax.scenes import dataset
 from tdanet_jax.scenes.offline import importer
@@ -126,6 +127,17 @@ def test_attention_is_averaged_over_the_test_episodes_and_one_is_drawn(
     )
     record = json.loads((opinionated_run / "episodes.jsonl").read_text().splitlines()[2])
     assert (out / f"{record['scene']}-{record['target']}.png").stat().st_size > 10_000
+
+
+def test_every_network_and_policy_has_a_folder_of_its_own(tmp_path):
+    run, point = tmp_path / "run", tmp_path / "run" / "history" / "00000020.npz"
+    greedy = Choice(policy="greedy")
+    for checkpoint, choice, name in (
+        (run, Choice(), "attention-sample"),
+        (run, greedy, "attention-greedy"),
+        (point, greedy, "attention-greedy-00000020"),
+    ):
+        assert attention.default_folder(attention.Command(checkpoint, choice)) == run / name
 
 
 def test_a_model_that_sees_an_image_and_adapts_stands_beside_another(

@@ -1,16 +1,21 @@
 """The sweep command, as a user types it."""
 
+import dataclasses
 import json
 import os
 import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
 
-from experiments import sweep
+from experiments import evaluate, sweep
+from tdanet_jax import files
+from tests.test_comparison import result
+from tests.test_sweep import BASE, made
 
 COMMAND = [sys.executable, "-m", "experiments.sweep"]
 TINY = [
@@ -53,12 +58,17 @@ def test_wrong_arguments_give_one_line_and_write_nothing(
 
 def test_a_sweep_trains_evaluates_the_history_and_reports(ithor, few_episodes, tmp_path, capsys):
     out = tmp_path / "sweep"
-    arguments = ["--seeds", "0", *TINY, "--out", str(out)]
+    (out / "random").mkdir(parents=True)
+    (out / "random" / "results.json").write_text(json.dumps(result(model="random")))
+    arguments = ["--seeds", "3", *TINY, "--out", str(out)]
     sweep.main(arguments)
-    run = out / "18-4-tdanet-seed0"
+    assert capsys.readouterr().err == (
+        f"warning: {out / 'random'}: no run (it has no config.json); left out\n"
+    )
+    run = out / "18-4-tdanet-seed3"
     assert {path.name for path in run.iterdir()} == RUN_FILES
     written = {"report.md", "report.json", "learning_curve-18-4.png", "histories", run.name}
-    assert {path.name for path in out.iterdir()} == written | {".lock"}
+    assert {path.name for path in out.iterdir()} == written | {".lock", "random"}
     report = json.loads((out / "report.json").read_text())
     models = report["comparison"]["18/4"]
     assert models["shortest_path"]["unseen"]["L>=1"]["SPL"] == {"mean": 100.0, "sd": None}
@@ -66,10 +76,46 @@ def test_a_sweep_trains_evaluates_the_history_and_reports(ithor, few_episodes, t
     assert len(report["learning_curves"]["18/4"]["tdanet"]["episodes"]) == 2
     assert set(report["costs"]["tdanet"]["milliseconds"]) == {"1", "1024"}
     assert "Split 14/8: nothing was trained." in (out / "report.md").read_text()
+    # The end of the curve, and an evaluation of the run, are its results again.
+    curve = report["learning_curves"]["18/4"]["tdanet"]
+    for group in ("seen", "unseen"):
+        assert curve[f"{group} SR"][-1] == models["tdanet"][group]["L>=1"]["SR"]
+    evaluate.main(["--checkpoint", str(run), "--out", str(tmp_path / "again")])
+    for name in ("episodes.jsonl", "results.json"):
+        assert (tmp_path / "again" / name).read_text() == (run / name).read_text()
 
     with pytest.raises(SystemExit):
         sweep.main([*arguments, "--step-limit", "7"])
     assert "trained with other values of --step-limit" in capsys.readouterr().err
+
+
+def test_what_cannot_stand_in_one_report_shows_before_anything_is_trained(tmp_path, capsys):
+    out, elsewhere = tmp_path / "sweep", made(tmp_path / "other", BASE, result())
+    with pytest.raises(SystemExit):
+        sweep.main(["--seeds", "0", "--out", str(out), "--include", str(elsewhere)])
+    assert "two runs are called 18-4-tdanet-seed0: rename one" in capsys.readouterr().err
+    made(out, dataclasses.replace(BASE, seed=1), result(1) | {"data_version": "e"})
+    with pytest.raises(SystemExit):
+        sweep.main(["--seeds", "2", "--out", str(out), "--include", str(elsewhere)])
+    assert "evaluated on other scene tables than" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["18-4-tdanet-seed1"]
+
+
+def test_a_report_waits_for_one_in_another_process(tmp_path, capsys):
+    order = []
+
+    def report():
+        with sweep.alone(tmp_path):
+            order.append("second")
+
+    with files.locked(tmp_path):
+        second = threading.Thread(target=report)
+        second.start()
+        second.join(timeout=0.3)
+        order.append("first")
+    second.join(timeout=10)
+    assert order == ["first", "second"]
+    assert "another process reports; waiting for it" in capsys.readouterr().out
 
 
 @pytest.mark.slow
