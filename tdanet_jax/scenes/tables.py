@@ -35,7 +35,7 @@ from tdanet_jax.untrusted import npz
 from tdanet_jax.vocabulary import ALL_TARGETS
 
 FIELD_OF_VIEW = 90.0
-#: Rooms that are computed at once, where there are as many cores; bounds the memory.
+#: Rooms that are computed at once, where there are as many cores: 2 GB of memory.
 MOST_WORKERS = 8
 
 Progress = Callable[[int, int], None]

@@ -21,21 +21,31 @@ def scene_file(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.parametrize(
+    "trained", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["evaluated", "trained"]
+)
 def test_own_rooms_as_the_page_shows_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    trained: bool,
 ) -> None:
-    """From the scene file to a trained agent."""
+    """From the scene file to results. What refuses rooms does so before it trains or plays."""
     monkeypatch.chdir(tmp_path)
     Path("my_rooms.json").write_text(block("scenes.md", "my_rooms.json"))
-    for line in block("scenes.md", "my_rooms commands").splitlines():
+    *lines, train = block("scenes.md", "my_rooms commands").splitlines()
+    if trained:
+        lines.append(shlex.join([*shlex.split(train), "--steps", "80", *TINY]))
+    for line in lines:
         python, _, module, *given = shlex.split(line)
         assert python == "python"
-        small = ("--steps", "80", *TINY) if module.endswith("train_zero_shot") else ()
-        importlib.import_module(module).main([*given, *small])
+        importlib.import_module(module).main(given)
     said = capsys.readouterr()
     assert said.err == ""
     assert "Rooms to train in: 1; to be evaluated in: 1" in said.out
-    for folder in ("random-in-my-rooms", "in-my-rooms"):
+    written = sorted(path.name for path in Path("runs").iterdir())
+    assert written == ["in-my-rooms", "random-in-my-rooms"][not trained :]
+    for folder in written:
         results = json.loads(Path("runs", folder, "results.json").read_text())
         assert results["seen"]["L>=1"]["n"] == 250
         assert list(results["by_room"]) == ["kitchen"]
