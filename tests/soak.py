@@ -5,7 +5,8 @@
 Runs the training command with its default network and batch on all cores and looks at its process
 once a second. Prints one JSON object: the slopes are of straight lines through the second half of
 the samples, when everything has been compiled and every buffer been used. Memory goes up and down
-with every checkpoint, so its medians over the quarters of the time stand beside the slope.
+with every checkpoint, so its medians over the quarters of the time stand beside the slope. With
+--out, the run is kept there, and the samples as soak.csv.
 """
 
 from __future__ import annotations
@@ -94,7 +95,9 @@ def soak(minutes: float, arguments: list[str], out: Path | None = None) -> dict[
     """Trains in `out`, or in a folder that is thrown away, and reports."""
     with tempfile.TemporaryDirectory() as folder:
         run = out or Path(folder) / "run"
-        return report(minutes, run, train(minutes, run, arguments))
+        samples = train(minutes, run, arguments)
+        np.savetxt(run / "soak.csv", samples, "%.1f", ",", header=",".join(FIELDS), comments="")
+        return report(minutes, run, samples)
 
 
 def main() -> None:
