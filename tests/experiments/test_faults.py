@@ -77,6 +77,7 @@ def own_assets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path
     assets.path.cache_clear()
 
 
+@pytest.mark.usefixtures("ithor")  # the rooms are there: no line about waiting for them
 @pytest.mark.parametrize("damage", [flip, halve, Path.unlink])
 @pytest.mark.parametrize("name", ["ithor.npz", "words.npz", "episodes.npz", "checksums.json"])
 def test_a_damaged_asset_is_one_line_and_nothing_is_written(
