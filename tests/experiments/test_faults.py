@@ -22,7 +22,7 @@ import pytest
 
 from experiments import evaluate as evaluating
 from experiments import train_zero_shot
-from tdanet_jax import assets, evaluation, files, task
+from tdanet_jax import assets, devices, evaluation, files, task
 from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.scenes import cache
 from tdanet_jax.training import METRICS_FILE, Journal, Run, read_metrics
@@ -172,6 +172,22 @@ def test_a_signal_in_any_phase_ends_in_one_line_and_the_run_goes_on(
     assert ends("--resume", out) is None
     assert_trained(out)
     assert json.loads((out / "results.json").read_text())["steps"] == 1200
+
+
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_waits_until_the_libraries_are_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], sent: int
+) -> None:
+    loaded = []
+
+    def struck() -> None:  # among the imports; one that is broken off may crash the process
+        os.kill(os.getpid(), sent)
+        loaded.append(True)
+
+    monkeypatch.setattr(devices, "keep_compiled", struck)
+    assert ends(*SHORT, "--out", tmp_path / "run") == 128 + sent
+    assert loaded == [True]
+    assert capsys.readouterr().out == "stopped; the run had not begun\n"
 
 
 def test_ctrl_c_ends_any_command_in_one_line(
