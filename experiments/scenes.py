@@ -72,7 +72,7 @@ class Verify:
         """Prints the tables."""
         check_positive(rooms=self.rooms, views=self.views, worst=self.worst)
         from tdanet_jax.scenes import ithor
-        from tdanet_jax.scenes.geometry import VIEWS
+        from tdanet_jax.scenes.poses import VIEWS
 
         start = time.monotonic()
         rooms = ithor.load_scenes()
@@ -136,13 +136,14 @@ def flag_lines(train: list[Scene], test: list[Scene], worst: int) -> Iterator[st
 def box_line(rooms: list[Scene], count: int, views: int) -> str:
     """Agreement of the boxes with dense ray casting on the same solids."""
     from tdanet_jax.scenes.agreement import Count, compare_boxes
+    from tdanet_jax.scenes.poses import VIEWS
     from tdanet_jax.scenes.rules import RULES
 
     draw = np.random.default_rng(0)
     overlaps: list[float] = []
     classes = Count()
     for i in np.linspace(0, len(rooms) - 1, count).astype(int):
-        states = draw.choice(len(rooms[i].points) * 16, views, replace=False)
+        states = draw.choice(len(rooms[i].points) * VIEWS, views, replace=False)
         more, case = compare_boxes(rooms[i], RULES, states)
         overlaps += more
         classes += case

@@ -18,12 +18,10 @@ import numpy as np
 from flax import struct
 
 from tdanet_jax.reward import DONE_REWARD, SIMILARITY_SHARE, STEP_REWARD, Parents
+from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ROOM_TYPES, Action
 
-#: A pose is (position * 8 + rotation) * 2 + horizon.
-ROTATIONS = 8
-POSES_PER_POSITION = 16
 #: Rows and columns of the class raster, the size of a ResNet-18 feature map.
 RASTER = (7, 7)
 #: Cells and channels of a ResNet-18 feature map.
@@ -62,7 +60,7 @@ class EnvParams(struct.PyTreeNode):
 class EnvState(struct.PyTreeNode):
     """One episode in progress."""
 
-    pose: jax.Array  # int32, (position * 8 + rotation) * 2 + horizon
+    pose: jax.Array  # int32, see scenes/poses.py
     target: jax.Array  # int32, index among the G targets
     steps: jax.Array  # int32, actions taken
     parents_seen: jax.Array  # int32, bit set over the target's three parents
@@ -180,7 +178,7 @@ def _episode_pool(
     An episode is valid if its target is visible from a state that its start can reach; rooms and
     pairs without a valid episode are left out.
     """
-    reachable = tables.distance.reshape(-1, POSES_PER_POSITION, len(tables.targets))[:, 0] >= 0
+    reachable = tables.reachable
     chosen = np.isin(np.array(tables.scenes), scenes)
     room_scenes = np.zeros((len(ROOM_TYPES), 2), np.int64)
     scene_pairs: list[tuple[int, int]] = []
@@ -253,7 +251,7 @@ def reset_state(key: jax.Array, params: EnvParams) -> EnvState:
     pair = _pick_from(bits[2], params.scene_pairs[scene])
     position = params.start_position[_pick_from(bits[3], params.pair_starts[pair])]
     rotation = (bits[0] & 7).astype(jnp.int32)  # bits that the choice of the room does not use
-    return start(params, (position * ROTATIONS + rotation) * 2, params.pair_target[pair])
+    return start(params, poses.join(position, rotation), params.pair_target[pair])
 
 
 def reset(key: jax.Array, params: EnvParams) -> tuple[Observation, EnvState]:
@@ -273,8 +271,8 @@ def observe(state: EnvState, params: EnvParams) -> Observation:
     in_view = jnp.arange(3 * longest, dtype=jnp.int32) < 3 * (last - first)
     features = None
     if params.features is not None and params.first_feature is not None:
-        position, pose = state.pose // POSES_PER_POSITION, state.pose % POSES_PER_POSITION
-        features = params.features[params.first_feature[position] + pose]
+        position, *view = poses.split(state.pose)
+        features = params.features[params.first_feature[position] + poses.join(0, *view)]
     return Observation(
         classes=jnp.where(mask, classes, 0),
         boxes=jnp.where(in_view, boxes, 0.0).reshape(longest, 3),
@@ -294,7 +292,7 @@ def is_visible(params: EnvParams, pose: jax.Array, cls: jax.Array) -> jax.Array:
 
 def move(params: EnvParams, pose: jax.Array, action: jax.Array) -> jax.Array:
     """The pose after an action; an impossible action leaves it as it is."""
-    position, rotation, horizon = pose >> 4, (pose >> 1) & 7, pose & 1
+    position, rotation, horizon = poses.split(pose)
     ahead = params.next_position[position, rotation]
     position = jnp.where(action == Action.MOVE_AHEAD, ahead, position)
     turn = jnp.where(action == Action.ROTATE_RIGHT, 1, 0)
@@ -302,7 +300,7 @@ def move(params: EnvParams, pose: jax.Array, action: jax.Array) -> jax.Array:
     rotation = (rotation + turn) & 7
     horizon = jnp.where(action == Action.LOOK_DOWN, 1, horizon)
     horizon = jnp.where(action == Action.LOOK_UP, 0, horizon)
-    return (position * ROTATIONS + rotation) * 2 + horizon
+    return poses.join(position, rotation, horizon)
 
 
 def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome:
@@ -318,7 +316,7 @@ def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome
     reward = jnp.where(~done & earns, partial, STEP_REWARD)
     reward = jnp.where(success, DONE_REWARD + at_done, reward)
     steps = state.steps + 1
-    limit = params.step_limit[params.position_room[pose >> 4].astype(jnp.int32)]
+    limit = params.step_limit[params.position_room[poses.split(pose).position].astype(jnp.int32)]
     return Outcome(
         state=seen.replace(pose=pose, steps=steps),
         reward=reward.astype(jnp.float32),

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tdanet_jax import episodes
-from tdanet_jax.env import POSES_PER_POSITION
 from tdanet_jax.episodes import Episodes
 from tdanet_jax.report import EPISODES_FILE
+from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
 
@@ -51,8 +51,7 @@ def find(
     if scene not in tables.scenes:
         raise ValueError(f"{scene}: no such room; there are {name_ranges(tables.scenes)}")
     index = tables.scenes.index(scene)
-    states = np.repeat(tables.position_scene == index, POSES_PER_POSITION)
-    within = tables.distance[states].max(axis=0, initial=-1) >= 0
+    within = tables.distance[tables.state_scene == index].max(axis=0, initial=-1) >= 0
     found = sorted(name for name, ok in zip(tables.targets, within, strict=True) if ok)
     if target not in found:
         raise ValueError(
@@ -106,7 +105,7 @@ def _parse(row: dict[str, Any], tables: SceneTables) -> Recorded:
         if name not in ACTION_NAMES:
             raise ValueError(f"{name!r}: no action; there are {', '.join(ACTION_NAMES)}")
     actions = np.array([ACTION_NAMES.index(name) for name in row["actions"]], int)
-    place = tables.position[episode.pose[0] // POSES_PER_POSITION][[0, 2]]
+    place = tables.position[poses.split(episode.pose[0]).position][[0, 2]]
     here = bool(np.allclose(place, start[:2], atol=1e-3))
     if not here or tables.distance[episode.pose[0], episode.target[0]] + 1 != row["L"]:
         raise ValueError("recorded on other scene tables")

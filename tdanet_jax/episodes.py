@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tdanet_jax import assets
-from tdanet_jax.env import POSES_PER_POSITION, ROTATIONS
+from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import GROUPS, ROOM_TYPES, UNSEEN, Split, make_split
@@ -50,8 +50,8 @@ def draw(
     """
     rng = np.random.default_rng(seed)
     index = {name: i for i, name in enumerate(tables.scenes)}
-    reachable = tables.distance.reshape(-1, POSES_PER_POSITION, len(tables.targets))[:, 0] >= 0
-    poses, goals = [], []
+    reachable = tables.reachable
+    starts, goals = [], []
     for room in ROOM_TYPES:
         options = []
         for scene in scenes:
@@ -67,9 +67,9 @@ def draw(
             goal = found[rng.integers(len(found))]
             valid = positions[reachable[positions, goal]]
             position = valid[rng.integers(len(valid))]
-            poses.append((position * ROTATIONS + rng.integers(ROTATIONS)) * 2)
+            starts.append(poses.join(position, rng.integers(poses.ROTATIONS)))
             goals.append(goal)
-    return Episodes(np.array(poses, np.int32), np.array(goals, np.int32))
+    return Episodes(np.array(starts, np.int32), np.array(goals, np.int32))
 
 
 def draw_split(tables: SceneTables, split: Split) -> dict[str, Episodes]:
@@ -125,7 +125,7 @@ def published(
     scenes = {name: i for i, name in enumerate(tables.scenes) if name in split.eval_scenes}
     lists: dict[str, Episodes] = {}
     for group, targets in zip(GROUPS, (split.seen, split.unseen), strict=True):
-        poses, goals = [], []
+        starts, goals = [], []
         for episode in listed:
             scene = scenes.get(episode.scene)
             if scene is None or episode.part != "test":
@@ -137,10 +137,10 @@ def published(
                 scene, episode.x, episode.z, episode.rotation, episode.horizon
             )
             if tables.distance[pose, goal] >= 0:
-                poses.append(pose)
+                starts.append(pose)
                 goals.append(goal)
-        if poses:
-            lists[group] = Episodes(np.array(poses, np.int32), np.array(goals, np.int32))
+        if starts:
+            lists[group] = Episodes(np.array(starts, np.int32), np.array(goals, np.int32))
     return lists
 
 

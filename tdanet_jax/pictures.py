@@ -20,6 +20,7 @@ from matplotlib.patheffects import withStroke
 from tdanet_jax import labels
 from tdanet_jax.attention import MIN_FRAMES, ClassPairs
 from tdanet_jax.figures import BLUE, ORANGE
+from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.floor_plan import FloorPlan
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.trace import Trace, View, view
@@ -218,11 +219,13 @@ def draw_way(
     axes: Axes, trace: Trace, plan: FloorPlan, tables: SceneTables, points_a_metre: float
 ) -> None:
     """Path, start, some fields of view, numbers of steps, and a star or a cross at the end."""
-    places = tables.position[trace.pose >> 4][:, [0, 2]]
+    pose = poses.split(trace.pose)
+    places = tables.position[pose.position][:, [0, 2]]
     size = points_a_metre * labels.plan_font(plan)
-    turns = (trace.pose >> 1 & 7) * 45
-    poses, first = np.unique(trace.pose[:-1] >> 1, return_index=True)  # the horizon left out
-    few = np.sort(first)[np.linspace(0, len(poses) - 1, min(len(poses), MOST_SECTORS)).astype(int)]
+    turns, _ = pose.degrees
+    level = poses.join(pose.position, pose.rotation)[:-1]  # the horizon left out
+    _, first = np.unique(level, return_index=True)
+    few = np.sort(first)[np.linspace(0, len(first) - 1, min(len(first), MOST_SECTORS)).astype(int)]
     for k in [*few, len(places) - 1]:
         sector = (tuple(places[k]), REACH, 45 - turns[k], 135 - turns[k])
         alpha = 0.3 if k == len(places) - 1 else 0.1

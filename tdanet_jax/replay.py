@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tdanet_jax import labels
-from tdanet_jax.scenes import floor_plan
+from tdanet_jax.scenes import floor_plan, poses
 from tdanet_jax.scenes.floor_plan import FloorPlan
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.trace import Trace, view
@@ -89,13 +89,15 @@ def _player(trace: Trace, tables: SceneTables) -> dict[str, Any]:
 def _step(trace: Trace, tables: SceneTables, i: int) -> dict[str, Any]:
     """What the page shows before action i, or at the end, where nothing is decided any more."""
     pose, last = int(trace.pose[i]), i == len(trace.actions)
-    x, _, z = tables.position[pose >> 4]
+    parts = poses.split(pose)
+    x, _, z = tables.position[parts.position]
+    rotation, horizon = parts.degrees
     seen = view(tables, pose)
     weights = None if trace.attention is None or last else trace.attention[i]
     step: dict[str, Any] = {
         "place": [round(METRE * float(x)), round(-METRE * float(z))],
-        "rotation": (pose >> 1 & 7) * 45,
-        "horizon": (pose & 1) * 30,
+        "rotation": rotation,
+        "horizon": horizon,
         "boxes": [
             [name, *_rounded(IMAGE * box), bool(near)]
             for name, box, near in zip(*seen, strict=True)

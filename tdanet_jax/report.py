@@ -17,6 +17,7 @@ from tdanet_jax import files, paper
 from tdanet_jax.episodes import Episodes
 from tdanet_jax.evaluation import Records
 from tdanet_jax.metrics import BUCKETS, grouped, summarise
+from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS, GROUPS, ROOM_TYPES
 
@@ -60,16 +61,17 @@ class Provenance:
 
 def columns(tables: SceneTables, episodes: Episodes, records: Records) -> dict[str, np.ndarray]:
     """Records as named columns of length E, with names in place of indices."""
-    position = episodes.pose >> 4
-    scene = tables.position_scene[position]
+    pose = poses.split(episodes.pose)
+    rotation, horizon = pose.degrees
+    scene = tables.position_scene[pose.position]
     return {
         "scene": np.array(tables.scenes)[scene],
         "room": np.array(ROOM_TYPES)[tables.room_type[scene]],
         "target": np.array(tables.targets)[episodes.target],
-        "x": tables.position[position, 0],
-        "z": tables.position[position, 2],
-        "rotation": 45 * ((episodes.pose >> 1) & 7),
-        "horizon": 30 * (episodes.pose & 1),
+        "x": tables.position[pose.position, 0],
+        "z": tables.position[pose.position, 2],
+        "rotation": rotation,
+        "horizon": horizon,
         "shortest": records.shortest,
         "length": records.length,
         "success": records.success,

@@ -15,7 +15,7 @@ from tdanet_jax import env, graph, zero_shot
 from tdanet_jax import words as word_vectors
 from tdanet_jax.classes import Classes, make_classes
 from tdanet_jax.config import MODELS, NetworkConfig, TrainConfig
-from tdanet_jax.env import POSES_PER_POSITION, TEST_STEP_LIMITS, EnvParams
+from tdanet_jax.env import TEST_STEP_LIMITS, EnvParams
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.reward import (
     Parents,
@@ -25,6 +25,7 @@ from tdanet_jax.reward import (
     no_parents,
     published_parents,
 )
+from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.dataset import Extras, Rooms, load_rooms, with_own_rooms
 from tdanet_jax.scenes.offline import importer
 from tdanet_jax.scenes.tables import Progress, SceneTables
@@ -192,7 +193,7 @@ def _feature_maps(features: np.ndarray) -> jax.Array:
 
 def _places(maps: jax.Array | None, chosen: np.ndarray) -> tuple[jax.Array, np.ndarray] | None:
     """The maps, and where among them the chosen positions [P] begin: nothing is copied."""
-    return None if maps is None else (maps, POSES_PER_POSITION * np.flatnonzero(chosen))
+    return None if maps is None else (maps, poses.join(np.flatnonzero(chosen)))
 
 
 def _parents(seen_rooms: SceneTables, split: Split, extras: Extras | None) -> Parents:

@@ -23,6 +23,7 @@ from tdanet_jax.evaluation import Records
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.policies import Policy
+from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.task import Task, task_in
@@ -163,7 +164,7 @@ def retrace(player: Player, tables: SceneTables, episode: Episodes, actions: np.
     goal = int(episode.target[0])
     trace = Trace(
         player=player.name,
-        scene=tables.scenes[tables.position_scene[pose[0] >> 4]],
+        scene=tables.scenes[tables.position_scene[poses.split(pose[0]).position]],
         target=tables.targets[goal],
         pose=pose,
         actions=np.asarray(actions, int),

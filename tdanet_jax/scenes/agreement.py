@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdanet_jax.scenes.geometry import HORIZONS, VIEWS, box_frame
+from tdanet_jax.scenes import poses
+from tdanet_jax.scenes.geometry import box_frame
 from tdanet_jax.scenes.rays import CLOSED, TURN_BITS
 from tdanet_jax.scenes.rules import Rules
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene
@@ -63,7 +64,7 @@ def default_frame(scene: Scene, rules: Rules) -> np.ndarray:
     assert scene.default_position is not None
     assert scene.default_rotation is not None
     sight = look_around(scene, rules, scene.default_position[None])
-    view = scene.default_rotation // 45 * HORIZONS
+    view = poses.from_degrees(0, scene.default_rotation, 0)
     result = np.zeros(len(scene.objects), bool)
     result[sight.owner[(sight.state == view) & sight.visible]] = True
     return result
@@ -90,9 +91,10 @@ class DenseView:
 
 def dense_view(scene: Scene, rules: Rules, state: int, pixels: int = 150) -> DenseView:
     """The view of `state` of a room with pixels x pixels rays, in float64."""
-    position, view = divmod(state, VIEWS)
-    camera = scene.points[position] + np.array([0, CAMERA_ABOVE_AGENT, 0])
-    rays = _pixel_rays(view, pixels)
+    pose = poses.split(state)
+    camera = scene.points[pose.position] + np.array([0, CAMERA_ABOVE_AGENT, 0])
+    turn, tilt = np.radians(pose.degrees)
+    rays = _pixel_rays(turn, tilt, pixels)
     occluders = _float_solids(scene, rules)
     share = np.zeros(len(scene.objects))
     box = np.zeros((len(scene.objects), 4))
@@ -109,10 +111,12 @@ def dense_view(scene: Scene, rules: Rules, state: int, pixels: int = 150) -> Den
     return DenseView(box, share)
 
 
-def _pixel_rays(view: int, pixels: int) -> np.ndarray:
-    """Directions [pixels^2, 3] through the pixels' middles, rows from the top; depth 1."""
-    heading, horizon = divmod(view, HORIZONS)
-    turn, tilt = np.radians(45 * heading), np.radians(30 * horizon)
+def _pixel_rays(turn: float, tilt: float, pixels: int) -> np.ndarray:
+    """Directions [pixels^2, 3] through the pixels' middles, rows from the top; depth 1.
+
+    Args:
+        turn, tilt: of the camera, in radians clockwise from +z and down.
+    """
     right = np.array([np.cos(turn), 0, -np.sin(turn)])
     level = np.array([np.sin(turn), 0, np.cos(turn)])
     up = np.array([0, np.cos(tilt), 0]) + np.sin(tilt) * level

@@ -30,6 +30,7 @@ _MODULES = (
     "archive",
     "scene",
     "rules",
+    "poses",
     "geometry",
     "rays",
     "solids",

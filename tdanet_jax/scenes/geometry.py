@@ -6,11 +6,10 @@ World axes are AI2-THOR's: x right, y up, z forward, left-handed; metres. Headin
 
 import numpy as np
 
+from tdanet_jax.scenes import poses
+from tdanet_jax.scenes.poses import HORIZONS, ROTATIONS
 from tdanet_jax.scenes.scene import GRID
 
-HEADINGS = 8
-HORIZONS = 2
-VIEWS = HEADINGS * HORIZONS
 # Grid steps of MoveAhead along each heading; a diagonal one moves a step on both axes.
 STEPS = np.array([(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)])
 
@@ -34,7 +33,7 @@ def next_positions(points: np.ndarray) -> np.ndarray:
     """
     cells = np.rint((points - points[0])[:, [0, 2]] / GRID).astype(np.int64)
     index = {(int(x), int(z)): i for i, (x, z) in enumerate(cells)}
-    result = np.empty((len(points), HEADINGS), np.int32)
+    result = np.empty((len(points), ROTATIONS), np.int32)
     for i, (x, z) in enumerate(cells):
         for heading, (dx, dz) in enumerate(STEPS):
             result[i, heading] = index.get((int(x + dx), int(z + dz)), i)
@@ -44,23 +43,15 @@ def next_positions(points: np.ndarray) -> np.ndarray:
 def transitions(next_position: np.ndarray) -> np.ndarray:
     """State after each of the five moving actions: [S, 5] int32, S = P * 16.
 
-    Columns are MoveAhead, RotateLeft, RotateRight, LookUp, LookDown; a state's index is
-    (position * 8 + heading) * 2 + horizon.
+    Columns are MoveAhead, RotateLeft, RotateRight, LookUp, LookDown.
     """
-    count = len(next_position)
-    position, heading, horizon = np.meshgrid(
-        np.arange(count), np.arange(HEADINGS), np.arange(HORIZONS), indexing="ij"
-    )
-
-    def state(p: np.ndarray, r: np.ndarray, h: np.ndarray) -> np.ndarray:
-        return ((p * HEADINGS + r % HEADINGS) * HORIZONS + h).reshape(-1)
-
+    position, rotation, horizon = poses.split(np.arange(next_position.size * HORIZONS))
     columns = [
-        state(next_position[position, heading], heading, horizon),
-        state(position, heading - 1, horizon),
-        state(position, heading + 1, horizon),
-        state(position, heading, np.zeros_like(horizon)),
-        state(position, heading, np.ones_like(horizon)),
+        poses.join(next_position[position, rotation], rotation, horizon),
+        poses.join(position, (rotation - 1) % ROTATIONS, horizon),
+        poses.join(position, (rotation + 1) % ROTATIONS, horizon),
+        poses.join(position, rotation, 0),
+        poses.join(position, rotation, 1),
     ]
     return np.stack(columns, axis=1).astype(np.int32)
 
@@ -115,7 +106,7 @@ def frustum_rotation(points: np.ndarray, visible: np.ndarray, camera: np.ndarray
     """
     offset = points - camera
     scores = []
-    for heading in range(0, HEADINGS, 2):
+    for heading in range(0, ROTATIONS, 2):
         x, z = STEPS[heading]
         depth = offset[..., 0] * x + offset[..., 2] * z
         side = offset[..., 0] * z - offset[..., 2] * x

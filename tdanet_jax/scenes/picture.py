@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle, Wedge
 
 from tdanet_jax import files
+from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.floor_plan import area, footprint
-from tdanet_jax.scenes.geometry import HORIZONS, VIEWS
 from tdanet_jax.scenes.rules import RULES
 from tdanet_jax.scenes.scene import Scene
 from tdanet_jax.scenes.solids import void_boxes
@@ -23,7 +23,8 @@ def most_telling_state(tables: SceneTables) -> int:
     pair = tables.row_state[tables.row_visible].astype(np.int64) * len(tables.classes)
     pair = np.unique(pair + tables.row_class[tables.row_visible])
     counts = np.bincount(pair // len(tables.classes), minlength=tables.num_states)
-    return int(counts[::HORIZONS].argmax()) * HORIZONS
+    counts[poses.split(np.arange(tables.num_states)).horizon > 0] = -1
+    return int(counts.argmax())
 
 
 def draw(scene: Scene, tables: SceneTables, state: int, path: Path) -> None:
@@ -45,11 +46,6 @@ def draw(scene: Scene, tables: SceneTables, state: int, path: Path) -> None:
         figure.savefig(fresh, dpi=110)
 
 
-def _pose(tables: SceneTables, state: int) -> tuple[np.ndarray, int, int]:
-    position, view = divmod(state, VIEWS)
-    return tables.position[position], view // HORIZONS * 45, view % HORIZONS * 30
-
-
 def _draw_plan(
     axes: Axes, scene: Scene, tables: SceneTables, state: int, seen: dict[int, bool]
 ) -> None:
@@ -68,7 +64,9 @@ def _draw_plan(
             x, z = footprint(scene, k).mean(axis=0)
             name = scene.objects[k].object_class
             axes.text(x, z, name, fontsize=6, color=color, ha="center", va="center", zorder=5)
-    (x, _, z), rotation, horizon = _pose(tables, state)
+    pose = poses.split(state)
+    x, _, z = tables.position[pose.position]
+    rotation, horizon = pose.degrees
     axes.add_patch(Wedge((x, z), 1.5, 45 - rotation, 135 - rotation, color="#f1c40f", alpha=0.3))
     axes.plot(x, z, "o", color="black", ms=6, zorder=6)
     axes.set_aspect("equal")

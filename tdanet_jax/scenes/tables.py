@@ -1,8 +1,7 @@
 """The tables that the agent's world consists of: all rooms, one after the other.
 
 Axes: R scenes, P positions, S = P * 16 states, C classes, G targets, N detection rows,
-O objects. A state's index is (position * 8 + heading) * 2 + horizon: headings are 45 degrees
-apart, clockwise from +z, horizon 0 looks level and 1 looks 30 degrees down.
+O objects. A state's index is that of its pose, see poses.py.
 """
 
 import dataclasses
@@ -17,16 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax.scenes import archive
+from tdanet_jax.scenes import archive, poses
 from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.geometry import (
-    HEADINGS,
-    HORIZONS,
-    VIEWS,
-    action_distances,
-    next_positions,
-    transitions,
-)
+from tdanet_jax.scenes.geometry import action_distances, next_positions, transitions
+from tdanet_jax.scenes.poses import VIEWS
 from tdanet_jax.scenes.raster import paint
 from tdanet_jax.scenes.rules import RULES, Rules
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, MOST_CLASSES, Scene
@@ -89,6 +82,11 @@ class SceneTables:
         """Scene of each state: [S] int16."""
         return np.repeat(self.position_scene, VIEWS)
 
+    @property
+    def reachable(self) -> np.ndarray:
+        """Whether the way from a position leads to where a target is seen: [P, G] bool."""
+        return self.distance[poses.join(np.arange(len(self.position)))] >= 0
+
     def visible_bits(self) -> np.ndarray:
         """Classes visible in each state: [S, ceil(C / 32)] uint32, class c is bit c % 32."""
         visible = np.zeros((self.num_states, -(-len(self.classes) // 32) * 32), bool)
@@ -109,7 +107,7 @@ class SceneTables:
         here = np.flatnonzero(self.position_scene == scene)
         offset = self.position[here][:, [0, 2]] - (x, z)
         position = int(here[(offset**2).sum(axis=1).argmin()])
-        return (position * HEADINGS + rotation // 45 % HEADINGS) * HORIZONS + horizon // 30
+        return poses.from_degrees(position, rotation, horizon)
 
     @cached_property
     def data_version(self) -> str:

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdanet_jax.scenes import rays
-from tdanet_jax.scenes.geometry import HEADINGS, HORIZONS, box_frame
+from tdanet_jax.scenes import poses, rays
+from tdanet_jax.scenes.geometry import box_frame
+from tdanet_jax.scenes.poses import HORIZONS
 from tdanet_jax.scenes.rules import Rules
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene, SceneObject
 from tdanet_jax.scenes.solids import THIN, Patches, millimetres, patches_of, solids_of
@@ -157,7 +158,7 @@ def _boxes_in_view(
                 )
             )
             first = rows[start]
-            state = (position[first] * HEADINGS + heading) * HORIZONS + horizon
+            state = poses.join(position[first], heading, horizon)
             box = _extents(across, *tilted(over, along, horizon), start)
             visible = np.add.reduceat(area[rows], start) >= least[group[first]]
             parts.append(Sight(state, owner[first], box, visible))

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from tdanet_jax import files
-from tdanet_jax.scenes import archive, cache, dataset
+from tdanet_jax.scenes import archive, cache, dataset, poses
 from tdanet_jax.scenes.dataset import Rooms
-from tdanet_jax.scenes.geometry import VIEWS
 from tdanet_jax.scenes.offline.extras import read_extras
 from tdanet_jax.scenes.offline.layout import (
     BOX_FILE,
@@ -29,6 +28,7 @@ from tdanet_jax.scenes.offline.layout import (
     scene_of,
 )
 from tdanet_jax.scenes.offline.reader import SceneData, describe, read_scene
+from tdanet_jax.scenes.poses import VIEWS
 from tdanet_jax.scenes.scene import MOST_CLASSES, Scene, SceneObject
 from tdanet_jax.scenes.tables import SceneTables, join, tabulate
 from tdanet_jax.scenes.visibility import Sight
@@ -246,7 +246,7 @@ def write_features(
     for i, name in enumerate(tables.scenes):
         here = np.flatnonzero(tables.position_scene == i)
         count = _copy_features(
-            sources[name], Grid(tables.position[here]), features, here[0] * VIEWS
+            sources[name], Grid(tables.position[here]), features, poses.join(here[0])
         )
         rest = len(here) * VIEWS - count
         note = f"; {rest} states without one are zero" if rest else ""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tdanet_jax.scenes.geometry import HEADINGS, HORIZONS
+from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.metadata import ALIGNED
 from tdanet_jax.scenes.scene import GRID
 from tdanet_jax.untrusted import FileError
@@ -51,10 +51,9 @@ def state_key(x: float, z: float, rotation: int, horizon: int) -> str:
 def state_keys(points: np.ndarray) -> list[str]:
     """Keys of all states of points [P, 3], in the order of the tables: P * 16."""
     return [
-        state_key(float(x), float(z), 45 * heading, 30 * horizon)
+        state_key(float(x), float(z), *poses.split(view).degrees)
         for x, _, z in points
-        for heading in range(HEADINGS)
-        for horizon in range(HORIZONS)
+        for view in range(poses.VIEWS)
     ]
 
 
@@ -100,7 +99,7 @@ class Grid:
         point = self._index.get((int(cell[0]), int(cell[1])))
         if point is None or np.abs(steps - cell).max() * GRID > ALIGNED:
             raise FileError(path, f"state {key} is not on the grid of grid.json")
-        return (point * HEADINGS + rotation // 45) * HORIZONS + horizon // 30
+        return poses.from_degrees(point, rotation, horizon)
 
 
 def first_file(folder: Path, names: Sequence[str]) -> Path | None:

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.geometry import HEADINGS, HORIZONS, STEPS, VIEWS, transitions
+from tdanet_jax.scenes.geometry import STEPS, transitions
 from tdanet_jax.scenes.metadata import FARTHEST, check_points
 from tdanet_jax.scenes.offline.layout import (
     BOX_FILE,
@@ -22,6 +23,7 @@ from tdanet_jax.scenes.offline.layout import (
     Grid,
     first_file,
 )
+from tdanet_jax.scenes.poses import HORIZONS, ROTATIONS, VIEWS
 from tdanet_jax.scenes.scene import GRID, Scene, SceneObject
 from tdanet_jax.scenes.visibility import IMAGE, SUBPIXEL, Sight
 from tdanet_jax.untrusted import FileError, jsons
@@ -147,13 +149,13 @@ def read_graph(path: Path, grid: Grid) -> tuple[np.ndarray, list[str]]:
 def _steps(grid: Grid, pairs: np.ndarray, nodes: set[int]) -> tuple[np.ndarray, list[str]]:
     count = len(grid.points)
     source, target = pairs.T
-    place, heading, horizon = source // VIEWS, source // HORIZONS % HEADINGS, source % HORIZONS
-    moved = (grid.points[target // VIEWS] - grid.points[place])[:, [0, 2]] / GRID
-    straight = (source % VIEWS == target % VIEWS) & (source != target)
+    (place, heading, horizon), end = poses.split(source), poses.split(target)
+    moved = (grid.points[end.position] - grid.points[place])[:, [0, 2]] / GRID
+    straight = (heading == end.rotation) & (horizon == end.horizon) & (source != target)
     step = straight & (np.abs(moved - STEPS[heading]).max(axis=1, initial=0) < 0.5)
-    result = np.repeat(np.arange(count, dtype=np.int32)[:, None], HEADINGS, axis=1)
-    result[place[step], heading[step]] = target[step] // VIEWS
-    opened = np.zeros((count, HEADINGS, HORIZONS), bool)
+    result = np.repeat(np.arange(count, dtype=np.int32)[:, None], ROTATIONS, axis=1)
+    result[place[step], heading[step]] = end.position[step]
+    opened = np.zeros((count, ROTATIONS, HORIZONS), bool)
     opened[place[step], heading[step], horizon[step]] = True
     turns = transitions(result)[:, 1:]  # [S, 4]
     size = count * VIEWS

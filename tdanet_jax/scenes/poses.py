@@ -1,0 +1,45 @@
+"""A pose as one number: (position * 8 + rotation) * 2 + horizon.
+
+Positions count a table's reachable points. Rotations are 45 degrees apart, clockwise from +z;
+horizon 0 looks level, 1 looks 30 degrees down. Where nothing else depends on the pose, the tables
+call it a state.
+"""
+
+from typing import Any, NamedTuple
+
+ROTATIONS = 8
+HORIZONS = 2
+#: Poses at a position.
+VIEWS = ROTATIONS * HORIZONS
+
+#: A whole number, or an array of them, of NumPy or of JAX.
+Integers = Any
+
+
+class Pose(NamedTuple):
+    """The parts of a pose."""
+
+    position: Integers
+    rotation: Integers  # 0 to 7
+    horizon: Integers  # 0 or 1
+
+    @property
+    def degrees(self) -> tuple[Integers, Integers]:
+        """Rotation and horizon in degrees."""
+        return 45 * self.rotation, 30 * self.horizon
+
+
+def split(pose: Integers) -> Pose:
+    """The parts of poses."""
+    # By shifts: // and % of JAX also look after negative numbers, in the environment's hot loop.
+    return Pose(pose >> 4, (pose >> 1) & 7, pose & 1)
+
+
+def join(position: Integers, rotation: Integers = 0, horizon: Integers = 0) -> Integers:
+    """Poses from their parts; without a position, the number of a view at any of them."""
+    return (position * ROTATIONS + rotation) * HORIZONS + horizon
+
+
+def from_degrees(position: Integers, rotation: Integers, horizon: Integers) -> Integers:
+    """Poses from a position and degrees: a multiple of 45, and 0 or 30."""
+    return join(position, rotation // 45 % ROTATIONS, horizon // 30)
