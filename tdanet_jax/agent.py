@@ -23,6 +23,7 @@ from tdanet_jax import words as word_vectors
 from tdanet_jax.checkpoint import FOLDER, Checkpoints
 from tdanet_jax.classes import Classes
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.detections import centre_and_area, merge_classes
 from tdanet_jax.env import Observation
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
@@ -137,22 +138,20 @@ class Agent:
     ) -> tuple[Observation, np.ndarray]:
         """The frame as the network sees it, and the row of each detection.
 
-        A row per detection; for a model made for it, a row per class: the mean of the boxes'
-        corners and the extent over all of them.
+        A row per detection; for a model made for it, a row per class.
         """
         labels = np.array([self._index(d.label) for d in detections], np.int32)
         corners = np.array([(d.x1, d.y1, d.x2, d.y2) for d in detections]).reshape(-1, 4)
-        owner = np.arange(len(detections))
         if (self.model.encoder.ROWS or self.config.network.rows) == "class":
             labels, owner = np.unique(labels, return_inverse=True)
+            order = np.argsort(owner, kind="stable")
+            _, found = merge_classes(owner[order], corners[order])
+        else:
+            owner, found = np.arange(len(labels)), centre_and_area(corners)
         count = len(labels)
         rows = max(-(-count // ROW_BLOCK), 1) * ROW_BLOCK
         classes, boxes = np.zeros((1, rows), np.int32), np.zeros((1, rows, 3), np.float32)
-        classes[0, :count] = labels
-        for i in range(count):
-            own = corners[owner == i]
-            width, height = own[:, 2:].max(axis=0) - own[:, :2].min(axis=0)
-            boxes[0, i] = *(own[:, :2] + own[:, 2:]).mean(axis=0) / 2, width * height
+        classes[0, :count], boxes[0, :count] = labels, found
         observation = Observation(
             classes=jnp.asarray(classes),
             boxes=jnp.asarray(boxes),

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from tdanet_jax import detections
 from tdanet_jax.reward import DONE_REWARD, SIMILARITY_SHARE, STEP_REWARD, Parents
 from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.tables import SceneTables
@@ -148,26 +149,19 @@ def make_params(
 def _detections(tables: SceneTables, merge: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Detections of all poses: start [S + 1], class [N] and (x, y, S) [N, 3] float32.
 
-    Merged, a class's instances are one row: the centre is the mean of their boxes' corners, S the
-    extent over all of them, as in the code of MJOLNIR and SSNet.
+    Merged, a class's instances are one row (`detections.merge_classes`).
     """
     boxed = tables.row_box[:, 0] >= 0  # what is visible without a known box is no detection
     corners = tables.row_box[boxed].astype(np.float64) / (tables.image * tables.subpixel)
-    centre = (corners[:, :2] + corners[:, 2:]) / 2
     start = np.concatenate([[0], np.cumsum(boxed)])[tables.row_start]
     classes = tables.row_class[boxed]
     if merge:
         key = tables.row_state[boxed].astype(np.int64) * len(tables.classes) + classes
-        first = np.flatnonzero(np.diff(key, prepend=-1))
-        if first.size:
-            members = np.diff(first, append=len(key))[:, None]
-            centre = np.add.reduceat(centre, first) / members
-            least = np.minimum.reduceat(corners[:, :2], first)
-            corners = np.hstack([least, np.maximum.reduceat(corners[:, 2:], first)])
-        classes = classes[first]
-        start = np.searchsorted(first, start)
-    area = (corners[:, 2] - corners[:, 0]) * (corners[:, 3] - corners[:, 1])
-    return start, classes, np.column_stack([centre, area]).astype(np.float32)
+        first, rows = detections.merge_classes(key, corners)
+        start, classes = np.searchsorted(first, start), classes[first]
+    else:
+        rows = detections.centre_and_area(corners)
+    return start, classes, rows.astype(np.float32)
 
 
 def _episode_pool(
