@@ -33,9 +33,10 @@ from experiments.console import (
     stoppable,
 )
 from experiments.train_zero_shot import figures_of, parse_command, prepare, report_on, title, train
-from tdanet_jax import sweep
+from tdanet_jax import sweep, sweep_report
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
-from tdanet_jax.sweep import Cost, Finished
+from tdanet_jax.sweep import Finished
+from tdanet_jax.sweep_report import Cost
 
 if TYPE_CHECKING:
     from tdanet_jax.training import Run
@@ -221,9 +222,9 @@ def write_report(out: Path, included: Sequence[Finished]) -> None:
         with reporter("histories") as show:
             for run, points in sweep.histories(runs, out):
                 show(points / max(run.config.history, points), run.folder.name)
-        curves = sweep.make_curves(runs, out)
+        curves = sweep_report.make_curves(runs, out)
         console.print("measuring inference ...")
-        found = sweep.Report(
+        found = sweep_report.Report(
             runs=runs,
             untrained=sweep.untrained(runs, UNTRAINED_SEED),
             costs=costs(runs),
@@ -234,8 +235,9 @@ def write_report(out: Path, included: Sequence[Finished]) -> None:
         names = {split: f"learning_curve-{split.replace('/', '-')}.png" for split in curves}
         for split, name in names.items():
             figures.evaluated_curves(curves[split], f"Split {split}, test rooms", out / name)
-        files.write_text(out / "report.json", json.dumps(sweep.to_json(found), indent=2) + "\n")
-        files.write_text(out / "report.md", sweep.markdown(found, names))
+        content = json.dumps(sweep_report.to_json(found), indent=2)
+        files.write_text(out / "report.json", content + "\n")
+        files.write_text(out / "report.md", sweep_report.markdown(found, names))
     console.print(f"wrote {out / 'report.md'}")
 
 
