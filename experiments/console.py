@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any, NoReturn, TypeVar
 
 import tyro
@@ -34,6 +35,8 @@ Arguments = TypeVar("Arguments")
 
 #: Without a terminal, progress is a line at most this often.
 SECONDS_BETWEEN_LINES = 10.0
+#: After which a signal that came during an import comes again.
+SECONDS_OF_A_MOMENT = 0.05
 
 console = Console(stderr=False, highlight=False, soft_wrap=True)
 
@@ -72,8 +75,8 @@ def parse(command: type[Arguments], arguments: Sequence[str] | None, **options: 
 
 @contextlib.contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Turns warnings, and errors that a user can cause (ValueError, OSError), into one line."""
-    with warnings.catch_warnings():
+    """Turns warnings, errors of the user (ValueError, OSError) and signals into one line each."""
+    with warnings.catch_warnings(), StopRequest().receiving():
         warnings.showwarning = _show_warning  # type: ignore[assignment]
         try:
             yield
@@ -81,9 +84,9 @@ def one_line_errors() -> Iterator[None]:
             fail(f"{error.filename}: {error.strerror}" if error.filename else error)
         except ValueError as error:
             fail(error)
-        except KeyboardInterrupt:
+        except Stopped as stopped:
             print("stopped", file=sys.stderr)
-            raise SystemExit(128 + signal.SIGINT) from None
+            raise SystemExit(128 + stopped.signal) from None
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
@@ -143,6 +146,8 @@ class Stopped(KeyboardInterrupt):
 class StopRequest:
     """Turns SIGTERM and Ctrl-C into `Stopped`, at once or, inside `deferred`, at its end.
 
+    While something is imported they wait: a library whose import is broken off may crash.
+
     Attributes:
       signal: the first one's number. Python drops what is raised while it collects garbage: such a
         stop happens at the next `deferred`.
@@ -167,28 +172,50 @@ class StopRequest:
         if self.signal is not None:
             raise Stopped(self.signal)
 
-    def receive(self, number: int, frame: Any) -> None:
-        """The signals' handler."""
-        first = self.signal is None
-        self.signal = number
-        if not (first and self._deferring):
+    @contextlib.contextmanager
+    def receiving(self) -> Iterator[None]:
+        """Inside, the signals come here."""
+        signals = (signal.SIGTERM, signal.SIGINT)
+        before = {number: signal.signal(number, self._receive) for number in signals}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if self._deferring and self.signal is None:
+            self.signal = number
+        elif _imports(frame):
+            _send_again(number)
+        else:
+            self.signal = number
             raise Stopped(number)
+
+
+def _imports(frame: FrameType | None) -> bool:
+    """Whether a frame belongs to an import."""
+    while frame is not None and frame.f_code.co_filename != "<frozen importlib._bootstrap>":
+        frame = frame.f_back
+    return frame is not None
+
+
+def _send_again(number: int) -> None:
+    """Has a signal come again in a moment."""
+    signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(number))
+    signal.setitimer(signal.ITIMER_REAL, SECONDS_OF_A_MOMENT)
 
 
 @contextlib.contextmanager
 def stoppable(advice: Callable[[], str]) -> Iterator[StopRequest]:
     """Inside, SIGTERM or Ctrl-C ends the program: one line of advice, status 128 + signal."""
     stop = StopRequest()
-    signals = (signal.SIGTERM, signal.SIGINT)
-    before = {number: signal.signal(number, stop.receive) for number in signals}
-    try:
-        yield stop
-    except Stopped as stopped:
-        console.print(f"stopped; {advice()}")
-        raise SystemExit(128 + stopped.signal) from None
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with stop.receiving():
+        try:
+            yield stop
+        except Stopped as stopped:
+            console.print(f"stopped; {advice()}")
+            raise SystemExit(128 + stopped.signal) from None
 
 
 class _Figures(ProgressColumn):

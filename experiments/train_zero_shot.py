@@ -129,13 +129,12 @@ def default_folder(config: TrainConfig) -> Path:
 def train(config: TrainConfig, folder: Path, command: Command) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
     with stoppable(lambda: how_to_go_on(folder)) as stop:
-        with stop.deferred():  # a library whose import is broken off may crash
-            from tdanet_jax import devices, episodes, files
-            from tdanet_jax.task import load_task, resolve, without_effect
-            from tdanet_jax.training import Run
+        from tdanet_jax import devices, episodes, files
+        from tdanet_jax.task import load_task, resolve, without_effect
+        from tdanet_jax.training import Run
 
-            mesh = devices.connect(command.devices)
-            devices.keep_compiled()
+        mesh = devices.connect(command.devices)
+        devices.keep_compiled()
         console.quiet = not devices.is_lead()
         with reporter("rooms", transient=True) as report_rooms:
             task = load_task(config, lambda done, total: report_rooms(done / total, "rebuilt"))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -105,7 +107,7 @@ def test_an_import_that_was_stopped_goes_on_where_it_was(
     for where, what in ((importer, "write_features"), (dataset, "save")):
 
         def stop(*_: Any) -> None:
-            raise KeyboardInterrupt
+            os.kill(os.getpid(), signal.SIGINT)
 
         with monkeypatch.context() as patch:
             patch.setattr(where, what, stop)

@@ -22,7 +22,7 @@ import pytest
 
 from experiments import evaluate as evaluating
 from experiments import train_zero_shot
-from tdanet_jax import assets, devices, evaluation, files, task
+from tdanet_jax import assets, evaluation, files, task
 from tdanet_jax.checkpoint import Checkpoints
 from tdanet_jax.scenes import cache
 from tdanet_jax.training import METRICS_FILE, Journal, Run, read_metrics
@@ -174,32 +174,57 @@ def test_a_signal_in_any_phase_ends_in_one_line_and_the_run_goes_on(
     assert json.loads((out / "results.json").read_text())["steps"] == 1200
 
 
+#: Sends a signal when a module is about to be imported, and tells at the end what was imported.
+STRIKER = """
+import atexit, os, sys
+
+class Striker:
+    def find_spec(self, name, *_):
+        if name == {name!r}:
+            os.kill(os.getpid(), {sent})
+
+sys.meta_path.insert(0, Striker())
+atexit.register(lambda: print({name!r} in sys.modules))
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "name", "sent"),
+    [
+        ("train_zero_shot", ("--out",), "jax.numpy", signal.SIGINT),
+        ("evaluate", ("--policy", "random", "--out"), "jax.numpy", signal.SIGTERM),
+        ("scenes", ("inspect", "FloorPlan1", "--out"), "matplotlib.figure", signal.SIGINT),
+    ],
+)
+def test_a_signal_waits_until_a_library_is_loaded(
+    tmp_path: Path, module: str, arguments: tuple[str, ...], name: str, sent: int
+) -> None:
+    """An import that is broken off may end in a traceback, or in a crash of the process."""
+    (tmp_path / "sitecustomize.py").write_text(STRIKER.format(name=name, sent=int(sent)))
+    path = {"PYTHONPATH": os.pathsep.join((str(tmp_path), os.getcwd()))}
+    done = command.run(module, *arguments, tmp_path / "out.png", variables=path)
+    assert done.returncode == 128 + sent, done.stderr
+    *said, loaded = done.stdout.splitlines()
+    assert loaded == "True"
+    assert [*said, *done.stderr.splitlines()] in (["stopped"], ["stopped; the run had not begun"])
+    assert not (tmp_path / "out.png").exists()
+
+
+def test_ctrl_c_ends_a_command_that_has_not_begun_without_a_word(tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text(STRIKER.format(name="tyro", sent=2))
+    path = {"PYTHONPATH": os.pathsep.join((str(tmp_path), os.getcwd()))}
+    done = command.run("evaluate", "--help", variables=path)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
 @pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_waits_until_the_libraries_are_loaded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], sent: int
+def test_a_signal_ends_any_command_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, sent: int
 ) -> None:
-    loaded = []
-
-    def struck() -> None:  # among the imports; one that is broken off may crash the process
-        os.kill(os.getpid(), sent)
-        loaded.append(True)
-
-    monkeypatch.setattr(devices, "keep_compiled", struck)
-    assert ends(*SHORT, "--out", tmp_path / "run") == 128 + sent
-    assert loaded == [True]
-    assert capsys.readouterr().out == "stopped; the run had not begun\n"
-
-
-def test_ctrl_c_ends_any_command_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(evaluating, "evaluate_untrained", interrupted)
+    monkeypatch.setattr(evaluating, "evaluate_untrained", lambda *_: os.kill(os.getpid(), sent))
     with pytest.raises(SystemExit) as stopped:
         evaluating.main(["--policy", "random", "--out", str(tmp_path / "out")])
-    assert stopped.value.code == 130
+    assert stopped.value.code == 128 + sent
     assert said_error(capsys) == "stopped"
 
 
