@@ -32,6 +32,7 @@ from experiments.console import (
     one_line_usage,
     reporter,
 )
+from tdanet_jax import files
 from tdanet_jax.scenes.scene import GRID
 from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TRAIN_SCENES_PER_TYPE, make_split
 
@@ -270,6 +271,7 @@ class Import:
         if self.features and self.source is not None:
             check_new_file(importer.features_path(self.out))
             maps = importer.find_features(self.source)
+        remove_abandoned(self.out, importer.features_path(self.out))
         rooms = _rebuilt(self.scenes) if self.scenes is not None else self._imported()
         print_survey(rooms.tables)
         print_needs(rooms)
@@ -296,6 +298,13 @@ class Import:
                 report(share, line)
 
             return importer.read_folder(self.source, say)
+
+
+def remove_abandoned(*outs: Path) -> None:
+    """Removes what was half-written of --out by processes that were killed."""
+    for out in outs:
+        for path in files.remove_abandoned(out):
+            console.print(f"removed {path}: half-written when its command was killed")
 
 
 def _rebuilt(path: Path) -> dataset.Rooms:
@@ -367,6 +376,7 @@ class Export:
         if self.word_vectors is not None and not self.vectors:
             fail(f"--word-vectors {self.word_vectors}: only with --vectors")
         check_new_file(self.out, in_folder=False)
+        remove_abandoned(self.out)
         with reporter("rooms", transient=True) as rebuilt:
             rooms = dataset.load_rooms(self.data, lambda n, total: rebuilt(n / total, "rebuilt"))
         tables, extras = rooms.tables, rooms.extras

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,11 @@ LOCK_FILE = ".lock"
 PARTIAL = ".partial-"
 
 
+def partial_path(path: Path) -> Path:
+    """Where this process writes what is to be at `path`: beside it."""
+    return path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A path to write to, beside `path`; renamed to `path` at the end, removed on an error.
@@ -24,7 +30,7 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
       OSError: it cannot be written; the error names `path`.
     """
-    fresh = path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
+    fresh = partial_path(path)
     try:
         yield fresh
         os.replace(fresh, path)
@@ -48,11 +54,38 @@ def remove_partial(folder: Path) -> list[Path]:
     """Removes what was half-written in `folder`, which nobody else may be writing to now."""
     found = sorted(folder.glob(f"{PARTIAL}*"))
     for path in found:
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
+        _remove(path)
     return found
+
+
+def remove_abandoned(path: Path) -> list[Path]:
+    """Removes what processes that are no more had half-written of `path`."""
+    name = re.compile(rf"{re.escape(PARTIAL)}(\d{{1,9}})-{re.escape(path.name)}")
+    found = []
+    for beside in sorted(path.parent.glob(f"{PARTIAL}*")):
+        match = name.fullmatch(beside.name)
+        if match is not None and not _runs(int(match[1])):
+            _remove(beside)
+            found.append(beside)
+    return found
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
+
+
+def _runs(process: int) -> bool:
+    """Whether there is a process of this number on this machine."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass  # somebody else's
+    return True
 
 
 @contextlib.contextmanager

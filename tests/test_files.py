@@ -1,5 +1,8 @@
 """Files appear whole or not at all."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -44,3 +47,20 @@ def test_what_was_half_written_is_removed(tmp_path: Path) -> None:
     assert len(files.remove_partial(tmp_path)) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
     assert files.remove_partial(tmp_path / "missing") == []
+
+
+def test_what_a_killed_process_had_half_written_of_a_file_is_removed(tmp_path: Path) -> None:
+    killed = subprocess.Popen([sys.executable, "-c", ""])
+    killed.wait()
+    begun = files.PARTIAL + str(killed.pid)
+    kept = {
+        "a.npz", "a.npz-b", f"{files.PARTIAL}{os.getpid()}-a.npz", f"{files.PARTIAL}1-a.npz",
+        f"{files.PARTIAL}a.npz", f"{begun}-b-a.npz", f"{begun}-aXnpz", f"{begun}-a.npz.b",
+    }  # fmt: skip
+    for name in (*kept, f"{begun}-a.npz"):
+        (tmp_path / name).write_text("half")
+    (tmp_path / f"{begun}-out" / "FloorPlan1").mkdir(parents=True)
+    assert files.remove_abandoned(tmp_path / "a.npz") == [tmp_path / f"{begun}-a.npz"]
+    assert files.remove_abandoned(tmp_path / "out") == [tmp_path / f"{begun}-out"]
+    assert {path.name for path in tmp_path.iterdir()} == kept
+    assert files.remove_abandoned(tmp_path / "missing" / "a.npz") == []

@@ -123,6 +123,8 @@ FAULTS = (
           "continue  # it is sound", "test_checkpoint.py"),
     Fault("written in place", "files.py", 'path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")',
           "path", "test_files.py"),
+    Fault("what is being written is removed", "files.py", "and not _runs(int(match[1]))", "",
+          "test_files.py"),
     Fault("half-written files stay", "files.py", "        fresh.unlink(missing_ok=True)\n",
           "        pass\n", "test_files.py"),
     Fault("cache built by all at once", "scenes/cache.py", "        _lock(stack)\n", "",

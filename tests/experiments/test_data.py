@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 
 import tdanet_jax
 from experiments import evaluate, scenes, train_zero_shot
+from tdanet_jax import files
 from tdanet_jax.agent import Detection
 from tdanet_jax.scenes import SceneTables, dataset
 from tdanet_jax.scenes.offline import importer
@@ -115,7 +117,13 @@ def test_an_import_that_was_stopped_goes_on_where_it_was(
                 scenes.main(command)
         assert not list(tmp_path.glob("*rooms*"))
         assert len(list((tmp_path / "parts").iterdir())) == 2
+    killed = subprocess.Popen([sys.executable, "-c", ""])
+    killed.wait()
+    left = f"{files.PARTIAL}{killed.pid}-rooms.features.npy"
+    Path(left).write_bytes(b"half")
+    capsys.readouterr()
     scenes.main(command)
+    assert f"removed {left}: half-written" in capsys.readouterr().out
     assert read == ["FloorPlan1", "FloorPlan21"]
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "original", "rooms.features.npy", "rooms.npz"

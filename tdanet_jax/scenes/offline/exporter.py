@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax.files import PARTIAL
+from tdanet_jax import files
 from tdanet_jax.scenes.geometry import transitions
 from tdanet_jax.scenes.offline.importer import Report
 from tdanet_jax.scenes.offline.layout import (
@@ -53,7 +53,7 @@ def write_folder(
     """
     if vectors is not None or features:
         hdf5.need_h5py(out)
-    fresh = out.with_name(f"{PARTIAL}{os.getpid()}-{out.name}")
+    fresh = files.partial_path(out)
     try:
         fresh.mkdir(parents=True)
         for i, name in enumerate(tables.scenes):
