@@ -55,6 +55,9 @@ class Command:
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote, in place of those of the run, or of the
     bundled ones."""
+    word_vectors: str | None = None
+    """File of word vectors, where rooms hold classes that the bundled ones lack; for the policies
+    that need no checkpoint. A run has its own."""
     seed: int | None = None
     """Seed of sampled actions. By default the run's own, which gives the results that its training
     ended with; 0 for the policies that need no checkpoint."""
@@ -78,6 +81,8 @@ def main(arguments: list[str] | None = None) -> None:
             fail(f"--split {command.split}: a run is evaluated on its own split")
         if trained and command.validation:
             fail("--validation: a trained run has its own rooms and classes")
+        if trained and command.word_vectors is not None:
+            fail(f"--word-vectors {command.word_vectors}: a trained run has its own")
         if len(set(command.checkpoint)) < len(command.checkpoint):
             fail("--checkpoint: a run is given twice")
         untrained_config(command).check()
@@ -108,9 +113,13 @@ def default_folder(command: Command) -> Path:
 
 def untrained_config(command: Command) -> TrainConfig:
     """The task and seed of the policies that need no checkpoint."""
-    split = command.split or TrainConfig().split
-    seed = command.seed or 0
-    return TrainConfig(split=split, validation=command.validation, data=command.data, seed=seed)
+    return TrainConfig(
+        split=command.split or TrainConfig().split,
+        validation=command.validation,
+        data=command.data,
+        word_vectors=command.word_vectors,
+        seed=command.seed or 0,
+    )
 
 
 def evaluate_untrained(command: Command, folder: Path) -> None:

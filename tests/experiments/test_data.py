@@ -56,15 +56,19 @@ def test_the_miniature_trains_and_evaluates(
     names = ["mug", "apple", "tabletop", "table"]
     lines = [" ".join(map(str, [name, *row])) for name, row in zip(names, vectors, strict=True)]
     Path("glove.txt").write_text("\n".join(lines))
-    files = ["--data", "rooms.npz", "--word-vectors", "glove.txt"]
+    rooms = ["--data", "rooms.npz", "--word-vectors", "glove.txt"]
     run = ["--steps", "800", *TINY, "--out", "run"]
-    message = fails(train_zero_shot, [*files, *run], capsys)
+    message = fails(train_zero_shot, [*rooms, *run], capsys)
     assert "no word vectors for TableTop (top)" in message
     assert not Path("run").exists()
+    shortest = ["--policy", "shortest_path", *rooms, "--out", "shortest"]
+    assert "no word vectors for TableTop (top)" in fails(evaluate, shortest, capsys)
 
     with Path("glove.txt").open("a") as file:
         file.write("\ntop 1 0 0 0 0 0 0\n")
-    train_zero_shot.main([*files, *run])
+    evaluate.main(shortest)
+    assert json.loads(Path("shortest/results.json").read_text())["seen"]["L>=1"]["SR"] == 100
+    train_zero_shot.main([*rooms, *run])
     results = json.loads(Path("run/results.json").read_text())
     assert results["data_version"] == dataset.load(Path("rooms.npz")).tables.data_version
     assert results["seen"]["L>=1"]["n"] == 2, "the published episodes"
