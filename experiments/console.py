@@ -86,7 +86,7 @@ def one_line_errors() -> Iterator[None]:
             fail(error)
         except Stopped as stopped:
             print("stopped", file=sys.stderr)
-            raise SystemExit(128 + stopped.signal) from None
+            stopped.answer()
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
@@ -136,11 +136,25 @@ def check_positive(**flags: int | Sequence[int]) -> None:
 
 
 class Stopped(KeyboardInterrupt):
-    """SIGTERM or Ctrl-C came; `signal` is its number."""
+    """SIGTERM or Ctrl-C came; `signal` is its number.
+
+    Python drops what is raised while it collects garbage, and some libraries drop what is raised
+    below them. The signal of a stop that nobody has `answered` comes again.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__()
         self.signal = number
+        self.answered = False
+
+    def __del__(self) -> None:
+        if not self.answered:
+            _send_again(self.signal)
+
+    def answer(self) -> NoReturn:
+        """Ends the program."""
+        self.answered = True
+        raise SystemExit(128 + self.signal) from None
 
 
 class StopRequest:
@@ -149,8 +163,7 @@ class StopRequest:
     While something is imported they wait: a library whose import is broken off may crash.
 
     Attributes:
-      signal: the first one's number. Python drops what is raised while it collects garbage: such a
-        stop happens at the next `deferred`.
+      signal: the first one's number.
     """
 
     def __init__(self) -> None:
@@ -177,9 +190,13 @@ class StopRequest:
         """Inside, the signals come here."""
         signals = (signal.SIGTERM, signal.SIGINT)
         before = {number: signal.signal(number, self._receive) for number in signals}
+        hook = sys.unraisablehook
+        # What is dropped is told to this hook, and would be printed.
+        sys.unraisablehook = lambda told: isinstance(told.exc_value, Stopped) or hook(told)
         try:
             yield
         finally:
+            sys.unraisablehook = hook
             for number, handler in before.items():
                 signal.signal(number, handler)
 
@@ -215,7 +232,7 @@ def stoppable(advice: Callable[[], str]) -> Iterator[StopRequest]:
             yield stop
         except Stopped as stopped:
             console.print(f"stopped; {advice()}")
-            raise SystemExit(128 + stopped.signal) from None
+            stopped.answer()
 
 
 class _Figures(ProgressColumn):

@@ -1,6 +1,12 @@
-"""Progress where there is no terminal: few lines, the first at once, with the time left."""
+"""Progress where there is no terminal: few lines, with the time left. Signals that are dropped."""
 
 from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Callable
 
 import pytest
 
@@ -39,3 +45,31 @@ def test_a_slow_report_is_a_line_each(
             clock[0] = 1000.0 + 3600 * report
             show(0.25, "")  # no progress: nothing to estimate from
     assert capsys.readouterr().out.splitlines() == ["training  25.0 %"] * 3
+
+
+class Struck:
+    """A signal comes when it is collected, where Python drops whatever is raised."""
+
+    def __del__(self) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def drop() -> None:
+    """As a library that drops what is raised below it."""
+    with contextlib.suppress(BaseException):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.mark.parametrize("dropped", [Struck, drop])
+def test_a_stop_that_is_dropped_comes_again(
+    dropped: Callable[[], object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def command() -> None:
+        with console.one_line_errors():
+            dropped()
+            time.sleep(10)
+
+    with pytest.raises(SystemExit) as stopped:
+        command()
+    assert stopped.value.code == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == "stopped\n"
