@@ -28,6 +28,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
+import experiments
 from tdanet_jax.files import LOCK_FILE, PARTIAL
 from tdanet_jax.vocabulary import GROUPS
 
@@ -154,7 +155,8 @@ class Stopped(KeyboardInterrupt):
     def answer(self) -> NoReturn:
         """Ends the program."""
         self.answered = True
-        raise SystemExit(128 + self.signal) from None
+        experiments.stopped = 128 + self.signal
+        raise SystemExit(experiments.stopped) from None
 
 
 class StopRequest:

@@ -181,10 +181,10 @@ import atexit, os, sys
 class Striker:
     def find_spec(self, name, *_):
         if name == {name!r}:
+            atexit.register(lambda: print({name!r} in sys.modules))
             os.kill(os.getpid(), {sent})
 
 sys.meta_path.insert(0, Striker())
-atexit.register(lambda: print({name!r} in sys.modules))
 """
 
 
