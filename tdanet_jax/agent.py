@@ -26,8 +26,9 @@ from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.detections import centre_and_area, merge_classes
 from tdanet_jax.env import Observation
 from tdanet_jax.models import actor_critic
-from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.actor_critic import ActorCritic, Output
 from tdanet_jax.models.layers import Carry
+from tdanet_jax.odometry import Trail, begin, follow, sense
 from tdanet_jax.task import make_model
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action, class_words
 from tdanet_jax.words import WordVectors
@@ -57,6 +58,8 @@ class Memory(NamedTuple):
 
     carry: Carry  # each [1, H]
     previous: jax.Array  # [1, 6], action probabilities of the step before
+    action: jax.Array  # int32, the action before; 6 at the start
+    trail: Trail | None  # the way up to that action; if the network senses it
 
 
 class Decision(NamedTuple):
@@ -94,9 +97,25 @@ class Agent:
         self._table: Any = None
         self._decide = jax.jit(self._forward)
 
-    def start(self) -> Memory:
-        """The memory at the start of an episode."""
-        return Memory(self.model.initial_carry(1, self.weights), jnp.zeros((1, NUM_ACTIONS)))
+    def start(self, rotation: int = 0) -> Memory:
+        """The memory at the start of an episode.
+
+        Args:
+          rotation: degrees, a multiple of 45; multiples of 90 lie along the grid on which the agent
+            moves. Only networks that sense their way (`--odometry`) need it.
+
+        Raises:
+          ValueError: the rotation is no multiple of 45.
+        """
+        if rotation % 45:
+            raise ValueError(f"rotation {rotation}: not a multiple of 45 degrees")
+        diagonal = jnp.int32(rotation // 45 % 2)
+        return Memory(
+            carry=self.model.initial_carry(1, self.weights),
+            previous=jnp.zeros((1, NUM_ACTIONS)),
+            action=jnp.int32(NUM_ACTIONS),
+            trail=begin(diagonal, jnp.int32(0)) if self.model.odometry else None,
+        )
 
     def act(
         self,
@@ -104,6 +123,7 @@ class Agent:
         detections: Sequence[Detection],
         target: str,
         key: jax.Array | None = None,
+        blocked: bool = False,
     ) -> tuple[Memory, Decision]:
         """One step.
 
@@ -112,6 +132,8 @@ class Agent:
           detections: the objects in view, in any order.
           target: what to look for, in English.
           key: samples the action, as in training; None takes the most probable one.
+          blocked: whether the action before was a MoveAhead that did not move the agent (AI2-THOR's
+            `lastActionSuccess` was False). Only networks that sense their way need it.
 
         Raises:
           KeyError: a label has a word without a word vector.
@@ -122,16 +144,18 @@ class Agent:
                 f"{self.config.model} looks at an image; an agent is shown detections alone"
             )
         obs, owner = self._observe(detections, target)
-        carry, logits, value, attention = self._decide(self.weights, self._prepared(), memory, obs)
+        memory, out, attention = self._decide(
+            self.weights, self._prepared(), memory, obs, jnp.asarray(blocked)
+        )
+        logits, value = out
         best = jnp.argmax(logits, -1) if key is None else jax.random.categorical(key, logits)
-        probabilities = jax.nn.softmax(logits)
         decision = Decision(
             action=Action(int(best[0])),
-            probabilities=np.asarray(probabilities[0]),
+            probabilities=np.asarray(memory.previous[0]),
             value=float(value[0]),
             attention=None if attention is None else np.asarray(attention[0])[owner],
         )
-        return Memory(carry, probabilities), decision
+        return memory._replace(action=best[0]), decision
 
     def _observe(
         self, detections: Sequence[Detection], target: str
@@ -180,14 +204,19 @@ class Agent:
         return self._table
 
     def _forward(
-        self, weights: Any, table: Any, memory: Memory, obs: Observation
-    ) -> tuple[Carry, jax.Array, jax.Array, jax.Array | None]:
+        self, weights: Any, table: Any, memory: Memory, obs: Observation, blocked: jax.Array
+    ) -> tuple[Memory, Output, jax.Array | None]:
+        """What the network says and attends to, and the memory behind it but for the action."""
+        trail = memory.trail
+        if trail is not None:
+            trail = follow(trail, memory.action, blocked)
+            obs = obs.replace(odometry=jax.tree.map(lambda x: x[None], sense(trail)))
         variables = {"params": weights}
         attention: Any = self.model.apply(variables, table, obs, method="attention")
         carry, out = actor_critic.forward(
             self.model, weights, table, memory.carry, obs, memory.previous, jnp.zeros(1, bool)
         )
-        return carry, out.logits, out.value, attention
+        return Memory(carry, jax.nn.softmax(out.logits), memory.action, trail), out, attention
 
 
 def load(run: Path | str) -> Agent:

@@ -97,6 +97,9 @@ class NetworkConfig:
     image: Literal["auto", "raster", "features"] = "auto"
     """What models that look at an image see: the classes of 7 x 7 cells, or the feature maps of
     ResNet-18 that were imported beside --data. auto: the maps where there are any."""
+    odometry: bool = False
+    """Lets the agent sense its own way: the last action and whether it was blocked, where it is
+    relative to its start, and a map of where it has been. Beyond the paper; any model takes it."""
     inner_rate: float = 1e-4
     """Size of the inner gradient steps of the models that adapt."""
     first_order: bool = False

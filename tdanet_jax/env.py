@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from tdanet_jax import detections
+from tdanet_jax import detections, odometry
+from tdanet_jax.odometry import Odometry, Trail
 from tdanet_jax.reward import DONE_REWARD, SIMILARITY_SHARE, STEP_REWARD, Parents
 from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.tables import SceneTables
@@ -56,6 +57,7 @@ class EnvParams(struct.PyTreeNode):
     features: jax.Array | None  # [S', 49, 512] float16, ResNet-18's maps of imported rooms; or none
     first_feature: jax.Array | None  # [P] int32, row of a position's first pose in `features`
     max_detections: int = struct.field(pytree_node=False)  # K, most detections in any pose
+    odometry: bool = struct.field(pytree_node=False, default=False)  # the agent senses its way
 
 
 class EnvState(struct.PyTreeNode):
@@ -67,6 +69,7 @@ class EnvState(struct.PyTreeNode):
     parents_seen: jax.Array  # int32, bit set over the target's three parents
     shortest: jax.Array  # int32, L: actions on the optimal path from the start, Done included
     similarity: jax.Array | None = None  # float32, largest cosine so far, if it is paid for
+    trail: Trail | None = None  # the way so far, if the agent senses it
 
 
 class Observation(struct.PyTreeNode):
@@ -79,6 +82,7 @@ class Observation(struct.PyTreeNode):
     empty: jax.Array  # bool, no detection at all
     cells: jax.Array | None = None  # [7, 7] int32, class of each image cell, -1 none; if asked for
     features: jax.Array | None = None  # [49, 512] float16, ResNet-18's map of an imported image
+    odometry: Odometry | None = None  # what the agent senses of its way; if asked for
 
 
 class Outcome(NamedTuple):
@@ -101,6 +105,7 @@ def make_params(
     similarity: np.ndarray | None = None,
     features: tuple[jax.Array, np.ndarray] | None = None,
     scenes: Sequence[str] | None = None,
+    odometry: bool = False,
 ) -> EnvParams:
     """Puts scene tables into the arrays that the environment reads.
 
@@ -116,6 +121,7 @@ def make_params(
       features: ResNet-18's maps of all poses of some rooms, [S', 49, 512], and for each position of
         these tables the row of its first pose there; observations then hold the map, too.
       scenes: the rooms in which `reset` begins an episode; by default all.
+      odometry: observations hold what the agent senses of its own way, too.
 
     Raises:
       ValueError: no episode is possible.
@@ -142,6 +148,7 @@ def make_params(
         raster=jnp.asarray(tables.raster, jnp.int8) if image else None,
         features=None if features is None else features[0],
         first_feature=None if features is None else jnp.asarray(features[1], jnp.int32),
+        odometry=odometry,
         **{name: jnp.asarray(v, jnp.int32) for name, v in pool.items()},
     )
 
@@ -222,6 +229,7 @@ def _pick_from(bits: jax.Array, span: jax.Array) -> jax.Array:
 def start(params: EnvParams, pose: jax.Array, target: jax.Array) -> EnvState:
     """The state at the start of the given episode."""
     zero = jnp.zeros_like(pose)
+    _, rotation, horizon = poses.split(pose)
     shortest = params.distance[pose, target].astype(jnp.int32) + 1
     return EnvState(
         pose=pose,
@@ -230,6 +238,7 @@ def start(params: EnvParams, pose: jax.Array, target: jax.Array) -> EnvState:
         parents_seen=zero,
         shortest=shortest,
         similarity=None if params.similarity is None else jnp.zeros_like(pose, jnp.float32),
+        trail=odometry.begin(rotation & 1, horizon) if params.odometry else None,
     )
 
 
@@ -275,6 +284,7 @@ def observe(state: EnvState, params: EnvParams) -> Observation:
         empty=last == first,
         cells=None if params.raster is None else params.raster[state.pose].astype(jnp.int32),
         features=features,
+        odometry=None if state.trail is None else odometry.sense(state.trail),
     )
 
 
@@ -289,12 +299,7 @@ def move(params: EnvParams, pose: jax.Array, action: jax.Array) -> jax.Array:
     position, rotation, horizon = poses.split(pose)
     ahead = params.next_position[position, rotation]
     position = jnp.where(action == Action.MOVE_AHEAD, ahead, position)
-    turn = jnp.where(action == Action.ROTATE_RIGHT, 1, 0)
-    turn = jnp.where(action == Action.ROTATE_LEFT, -1, turn)
-    rotation = (rotation + turn) & 7
-    horizon = jnp.where(action == Action.LOOK_DOWN, 1, horizon)
-    horizon = jnp.where(action == Action.LOOK_UP, 0, horizon)
-    return poses.join(position, rotation, horizon)
+    return poses.join(position, *odometry.turn(rotation, horizon, action))
 
 
 def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome:
@@ -311,8 +316,11 @@ def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome
     reward = jnp.where(success, DONE_REWARD + at_done, reward)
     steps = state.steps + 1
     limit = params.step_limit[params.position_room[poses.split(pose).position].astype(jnp.int32)]
+    trail = state.trail
+    if trail is not None:
+        trail = odometry.follow(trail, action, pose == state.pose)
     return Outcome(
-        state=seen.replace(pose=pose, steps=steps),
+        state=seen.replace(pose=pose, steps=steps, trail=trail),
         reward=reward.astype(jnp.float32),
         terminated=done,
         truncated=~done & (steps >= limit),
@@ -349,6 +357,15 @@ def _partial_reward(
 
     seen = state.parents_seen | jnp.sum(jnp.where(in_view, bits, 0), axis=-1, dtype=jnp.int32)
     return jnp.any(fresh), largest(fresh), largest(in_view), state.replace(parents_seen=seen)
+
+
+def choose(chosen: jax.Array, new: EnvState, old: EnvState) -> EnvState:
+    """`new` where `chosen` [B], else `old`, in a batch of B episodes."""
+
+    def one(chosen: jax.Array, new: EnvState, old: EnvState) -> EnvState:
+        return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), new, old)
+
+    return jax.vmap(one)(chosen, new, old)
 
 
 def step(

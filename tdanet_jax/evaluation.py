@@ -133,7 +133,7 @@ def _play(
         step, state, memory, alive, success, actions = loop
         memory, action = policy.act(weights, memory, jax.random.fold_in(key, step), state, params)
         out = transition(state, action, params)
-        state = jax.tree.map(lambda new, old: jnp.where(alive, new, old), out.state, state)
+        state = env.choose(alive, out.state, state)
         actions = actions.at[:, step].set(jnp.where(alive, action, -1).astype(jnp.int8))
         success = success | (alive & out.success)
         return step + 1, state, memory, alive & ~out.terminated & ~out.truncated, success, actions

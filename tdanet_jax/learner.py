@@ -149,7 +149,7 @@ def rollout(
         waits = truncated if config.bootstrap_truncated else jnp.zeros_like(truncated)
         over = held | terminated | (truncated & ~waits)
         begun = _reset(reset_key, params, batch)
-        following = jax.tree.map(lambda new, old: jnp.where(over, new, old), begun, moved.state)
+        following = env.choose(over, begun, moved.state)
         step = Rollout(
             obs=obs,
             previous=state.previous,

@@ -169,6 +169,7 @@ def make_task(
             *shown,
             greatest_similarity(seen_rooms, cosines(train_words)) if paid == "similarity" else None,
             _places(maps, trains),
+            odometry=model.odometry,
         ),
         eval_params=env.make_params(
             tables,
@@ -178,6 +179,7 @@ def make_task(
             *shown,
             features=_places(maps, trains | True),
             scenes=split.eval_scenes,
+            odometry=model.odometry,
         ),
         train_words=jnp.asarray(train_words),
         words=jnp.asarray(words),
@@ -263,4 +265,4 @@ def make_model(config: TrainConfig, classes: Classes) -> ActorCritic:
     network = config.network
     dtype = jnp.dtype(resolve_precision(network).precision)
     model: ActorCritic = module.make(network, classes, dtype, **options)
-    return model
+    return model.clone(odometry=network.odometry)

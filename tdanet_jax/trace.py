@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tdanet_jax import agent, attention, env, evaluation, policies
-from tdanet_jax.env import EnvParams
+from tdanet_jax.env import EnvParams, EnvState
 from tdanet_jax.episodes import Episodes
 from tdanet_jax.evaluation import Records
 from tdanet_jax.models import actor_critic
@@ -207,11 +207,10 @@ STEP_BLOCK = 200
 def _think(player: Player, tables: SceneTables, trace: Trace, goal: int) -> Trace:
     """The trace with what the network made of every step."""
     count = len(trace.actions)
-    padded = np.resize(trace.pose[:-1], -(-count // STEP_BLOCK) * STEP_BLOCK)
-    task = player.task
-    thoughts = _thoughts(
-        player.model, player.weights, task.words, task.eval_params, padded, np.int32(goal)
-    )
+    padded = np.resize(trace.actions, -(-count // STEP_BLOCK) * STEP_BLOCK)
+    task, pose = player.task, jnp.asarray(trace.pose[0])
+    start = env.start(task.eval_params, pose, jnp.int32(goal))
+    thoughts = _thoughts(player.model, player.weights, task.words, task.eval_params, start, padded)
     steps = jax.tree.map(lambda x: np.asarray(x, np.float64)[:count], thoughts)
     rows = [_rows_of_objects(task.eval_params, tables, pose) for pose in trace.pose[:-1]]
 
@@ -254,14 +253,13 @@ def _thoughts(
     weights: Any,
     words: jax.Array,
     params: EnvParams,
-    pose: jax.Array,
-    target: jax.Array,
+    start: EnvState,
+    actions: jax.Array,
 ) -> _Thoughts:
     table = actor_critic.prepare(model, weights, words)
 
-    def step(memory: tuple, pose: jax.Array) -> tuple[tuple, _Thoughts]:
-        carry, previous, fresh = memory
-        state = env.start(params, pose, target)
+    def step(memory: tuple, action: jax.Array) -> tuple[tuple, _Thoughts]:
+        state, carry, previous, fresh = memory
         obs = jax.tree.map(lambda x: x[None], env.observe(state, params))
         carry, out, look = attention.forward(model, weights, table, carry, obs, previous, fresh)
         probabilities = jax.nn.softmax(out.logits)
@@ -269,7 +267,9 @@ def _thoughts(
         thoughts = _Thoughts(
             probabilities, out.value, look.attention, look.correspondence, difference
         )
-        return (carry, probabilities, jnp.zeros(1, bool)), jax.tree.map(lambda x: x[0], thoughts)
+        state = env.transition(state, action, params).state
+        memory = state, carry, probabilities, jnp.zeros_like(fresh)
+        return memory, jax.tree.map(lambda x: x[0], thoughts)
 
-    memory = model.initial_carry(1, weights), jnp.zeros((1, NUM_ACTIONS)), jnp.ones(1, bool)
-    return jax.lax.scan(step, memory, pose)[1]
+    carry, previous = model.initial_carry(1, weights), jnp.zeros((1, NUM_ACTIONS))
+    return jax.lax.scan(step, (start, carry, previous, jnp.ones(1, bool)), actions)[1]

@@ -11,7 +11,11 @@ from flax import linen as nn
 from tdanet_jax.env import FEATURES, RASTER, Observation
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import LSTM, TAPE, Carry, Linear
+from tdanet_jax.odometry import numbers, sensed_at_start
 from tdanet_jax.vocabulary import NUM_ACTIONS
+
+#: Units of the layer that reads the odometry.
+ODOMETRY_UNITS = 64
 
 
 class Output(NamedTuple):
@@ -29,14 +33,19 @@ class ActorCritic(nn.Module):
       hidden: units of the LSTM.
       action_width: units of the embedding of the previous action probabilities.
       dtype: operands of the LSTM's products.
+      odometry: whether the agent senses its own way (`Observation.odometry`), which a layer of
+        `ODOMETRY_UNITS` then adds to the features. Not the paper's.
     """
 
     encoder: Encoder
     hidden: int = 512
     action_width: int = 10
     dtype: Any = jnp.float32
+    odometry: bool = False
 
     def setup(self) -> None:
+        if self.odometry:
+            self.way = Linear(ODOMETRY_UNITS)
         if self.encoder.ACTION != "plain":
             self.action_embedding = Linear(self.action_width)
         self.lstm = LSTM(self.hidden, self.dtype)
@@ -79,6 +88,11 @@ class ActorCritic(nn.Module):
         if self.encoder.ACTION != "plain":
             action = nn.relu(self.action_embedding(previous))
         features = self.encoder(table, obs, action, keep)
+        if self.odometry:
+            if obs.odometry is None:
+                raise ValueError("the network senses its way, and the observations do not hold it")
+            way = nn.relu(self.way(numbers(obs.odometry)))
+            features = jnp.concatenate([features, way], axis=-1)
         return features, action[..., :0] if self.encoder.ACTION == "inside" else action
 
     def decide(self, hidden: jax.Array) -> Output:
@@ -113,6 +127,7 @@ class ActorCritic(nn.Module):
             empty=jnp.ones(batch, bool),
             cells=jnp.full((batch, *RASTER), -1, jnp.int32) if self.encoder.IMAGE else None,
             features=jnp.zeros((batch, *FEATURES), jnp.float16) if self.encoder.maps else None,
+            odometry=sensed_at_start(batch) if self.odometry else None,
         )
 
     def initialise(self, key: jax.Array, words: jax.Array) -> Any:

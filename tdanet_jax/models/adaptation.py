@@ -158,10 +158,14 @@ class AdaptiveActorCritic(ActorCritic):
             self.learned_loss(jnp.zeros((1, self.stretch, self.hidden + NUM_ACTIONS)))
             return super().__call__(table, carry, obs, previous, fresh, keep)
         network = Network(self.clone(parent=None), self.variables["params"], table)
-        given = Given(self.encoder.view(obs), previous, fresh, keep)
+        given = Given(self.view(obs), previous, fresh, keep)
         if fresh.ndim == 1:
             return network.act(carry, given)
         return network.play(carry, given)
+
+    def view(self, obs: Observation) -> Observation:
+        """What of the observations the network uses, in shapes that are the same for all frames."""
+        return self.encoder.view(obs).replace(odometry=obs.odometry)
 
     def recall(self, hidden: jax.Array) -> jax.Array:
         """The learned loss [B] of k hidden states [B, k, H]."""
@@ -178,7 +182,7 @@ class AdaptiveActorCritic(ActorCritic):
         gates = 4 * self.hidden
         kernel = weights["lstm"]["kernel"].shape[0] + aside_kernel(weights["lstm"]).shape[0]
         given = Given(
-            obs=self.encoder.view(self.blank(batch)),
+            obs=self.view(self.blank(batch)),
             previous=jnp.zeros((batch, NUM_ACTIONS)),
             fresh=jnp.zeros(batch, bool),
             keep=jnp.zeros((batch, self.encoder.dropout_units), bool)
