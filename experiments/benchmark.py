@@ -52,6 +52,8 @@ class Command:
     """Run whose trained network the `evaluation` part plays; by default an untrained one."""
     models: tuple[str, ...] = ("tdanet",)
     """Models of the `rollout`, `update` and `decision` parts."""
+    odometry: bool = False
+    """Those models sense their own way, as with the flag of the training command."""
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
     devices: int = 1
@@ -146,7 +148,7 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
     acts = {"rollout", "update"} & set(command.parts)
     measured = set()
     for asked in command.precisions if acts else ():
-        network = NetworkConfig(precision=asked)
+        network = NetworkConfig(precision=asked, odometry=command.odometry)
         task = load_task(TrainConfig(model=name, network=network, data=command.data))
         precision = jnp.dtype(task.model.dtype).name
         if precision in measured:  # some models multiply in float32, whatever is asked for
@@ -160,7 +162,8 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
                 share = measure.share_of_peak(task, row, peak) if name == "tdanet" else {}
                 yield {**row, **share, "precision": precision}
     if "decision" in command.parts:
-        task = load_task(TrainConfig(model=name, data=command.data))
+        network = NetworkConfig(odometry=command.odometry)
+        task = load_task(TrainConfig(model=name, network=network, data=command.data))
         for count in (1, 1024):
             yield measure.decision_row(task, count, command.repeats)
 

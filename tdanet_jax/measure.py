@@ -17,11 +17,21 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from tdanet_jax import devices, env, episodes, evaluation, learner, parameters, policies, saved
+from tdanet_jax import (
+    devices,
+    env,
+    episodes,
+    evaluation,
+    learner,
+    odometry,
+    parameters,
+    policies,
+    saved,
+)
 from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import EnvParams
 from tdanet_jax.models import actor_critic
-from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.actor_critic import ODOMETRY_UNITS, ActorCritic
 from tdanet_jax.task import Task, load_task
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
@@ -168,8 +178,9 @@ def tdanet_forward_macs(model: ActorCritic, words_width: int) -> int:
     width, hidden = model.encoder.width, model.hidden
     encoder = (3 + words_width) * width + 3 * width * width
     action = NUM_ACTIONS * model.action_width
-    lstm = (width + model.action_width + hidden) * 4 * hidden
-    return encoder + action + lstm + hidden * (NUM_ACTIONS + 1)
+    way = ODOMETRY_UNITS if model.odometry else 0
+    lstm = (width + way + model.action_width + hidden) * 4 * hidden
+    return encoder + action + way * odometry.NUMBERS + lstm + hidden * (NUM_ACTIONS + 1)
 
 
 def update_cost(

@@ -24,9 +24,8 @@ MAP = 64
 WINDOW = 9
 #: Bits of a cell: one for each heading in which the agent stood there, then "blocked".
 BLOCKED = 1 << ROTATIONS
-#: Numbers that `sense` gives, and bits of its window.
-MOTION = 6 + NUM_ACTIONS
-WINDOW_BITS = WINDOW * WINDOW * (ROTATIONS + 1)
+#: Length of `numbers`.
+NUMBERS = 6 + NUM_ACTIONS + WINDOW * WINDOW * (ROTATIONS + 1)
 #: Metres are divided by this many cells (4 m).
 REACH = 16.0
 #: The cell that MoveAhead leads to, by heading, as (right, ahead).
@@ -143,9 +142,9 @@ def sense(trail: Trail) -> Odometry:
 
 
 def numbers(sensed: Odometry) -> jax.Array:
-    """All of it as float32, [..., MOTION + WINDOW_BITS], from leading axes [...]."""
+    """All of it as float32, [..., NUMBERS], from leading axes [...]."""
     bits = sensed.window[..., None] >> jnp.arange(ROTATIONS + 1, dtype=jnp.uint16) & 1
-    flat = bits.reshape(*bits.shape[:-3], WINDOW_BITS)
+    flat = bits.reshape(*bits.shape[:-3], -1)
     return jnp.concatenate([sensed.motion, flat.astype(jnp.float32)], axis=-1)
 
 

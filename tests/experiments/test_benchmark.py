@@ -58,16 +58,26 @@ def test_a_model_that_multiplies_in_float32_alone_is_measured_once(ithor, tmp_pa
 
 def test_decisions_of_any_model_are_timed(ithor, tmp_path):
     out = tmp_path / "figures.jsonl"
-    arguments = ["--parts", "decision", "--models", "ssnet", "--repeats", "1", "--out"]
+    arguments = [
+        "--parts",
+        "decision",
+        "--models",
+        "ssnet",
+        "--repeats",
+        "1",
+        "--odometry",
+        "--out",
+    ]
     benchmark.main([*arguments, str(out)])
     rows = [json.loads(line) for line in out.read_text().splitlines()][1:]
     assert [(row["model"], row["batch"]) for row in rows] == [("ssnet", 1), ("ssnet", 1024)]
     assert all(row["milliseconds"] > 0 and row["parameters"] > 2e6 for row in rows)
 
 
-def test_the_hand_formula_counts_the_kernels_that_a_step_uses():
+@pytest.mark.parametrize("odometry", [False, True])
+def test_the_hand_formula_counts_the_kernels_that_a_step_uses(odometry):
     """All kernels but W_L's, which is used once per update for the table of classes."""
-    network = NetworkConfig(width=32, hidden=48, precision="float32")
+    network = NetworkConfig(width=32, hidden=48, precision="float32", odometry=odometry)
     model = make_model(TrainConfig(network=network), Classes())
     weights = jax.eval_shape(model.initialise, jax.random.key(0), jnp.ones((5, 50)))
     del weights["encoder"]["attention"]
