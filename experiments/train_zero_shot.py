@@ -49,8 +49,9 @@ class Command:
     """Trains an agent on the iTHOR training rooms and reports SR and SPL in the test rooms."""
 
     run: tyro.conf.OmitArgPrefixes[TrainConfig]
-    preset: Literal["default", "paper"] = "default"
-    """paper: the reference's constants and its budget of 6 M episodes; other flags still apply."""
+    preset: Literal["default", "best", "paper"] = "default"
+    """Defaults of the other flags. best: what did best on validation, beyond the paper: --odometry
+    and --gamma 0.97. paper: the reference's constants and its budget of 6 M episodes."""
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""
     resume: Path | None = None

@@ -273,7 +273,9 @@ PAPER = TrainConfig(
     ),
     network=NetworkConfig(dropout=0.25, rows="object"),
 )
-PRESETS = {"default": TrainConfig(), "paper": PAPER}
+#: What did best on validation, beyond the paper (docs/results.md).
+BEST = TrainConfig(learner=LearnerConfig(gamma=0.97), network=NetworkConfig(odometry=True))
+PRESETS = {"default": TrainConfig(), "best": BEST, "paper": PAPER}
 
 
 def to_json(config: TrainConfig) -> dict[str, Any]:
