@@ -98,7 +98,7 @@ class Agent:
         self._decide = jax.jit(self._forward)
 
     def start(self, rotation: int = 0) -> Memory:
-        """The memory at the start of an episode.
+        """The memory at the start of an episode, looking level.
 
         Args:
           rotation: degrees, a multiple of 45; multiples of 90 lie along the grid on which the agent
@@ -126,6 +126,10 @@ class Agent:
         blocked: bool = False,
     ) -> tuple[Memory, Decision]:
         """One step.
+
+        The memory takes it that the decision is carried out (else, replace its `action`), and that
+        a MoveAhead leads to the next point of the grid: 0.25 m on one axis, on both along a
+        diagonal.
 
         Args:
           memory: from `start` or the step before.

@@ -33,7 +33,11 @@ AHEAD = np.array([(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (
 
 
 def _window_offsets() -> np.ndarray:
-    """The cells of the window, [8, WINDOW, WINDOW, 2], by heading: first row far ahead."""
+    """The cells of the window, [8, WINDOW, WINDOW, 2], by heading: first row far ahead.
+
+    Along a diagonal, the nearest cells to a square that is turned by 45 degrees: some stand in two
+    places of it, and some in none.
+    """
     middle = WINDOW // 2
     row, column = np.mgrid[:WINDOW, :WINDOW]
     right, ahead = column - middle, middle - row

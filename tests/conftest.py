@@ -125,8 +125,11 @@ def save_untrained(
     (folder / CONFIG_FILE).write_text(json.dumps(configs.to_json(config)))
     task = make_task(config, tables, vectors, features=features)
     task.classes.save(folder)
-    weights = samples.parameters(task.model, task.words)
-    weights["actor"]["bias"] = weights["actor"]["bias"].at[Action.DONE].set(-1.0)
+    if config.network.odometry:
+        weights = samples.going_by_odometry(task.model, task.words)
+    else:
+        weights = samples.parameters(task.model, task.words)
+        weights["actor"]["bias"] = weights["actor"]["bias"].at[Action.DONE].set(-1.0)
     rest = {field.name: jnp.int32(0) for field in dataclasses.fields(TrainState)}
     state = TrainState(**rest | {"params": weights, "key": jax.random.key(0)})
     Checkpoints(folder).save(state, {"seconds": 0.0, "data_version": tables.data_version})

@@ -37,6 +37,15 @@ def agent(weights, glove):
     return Agent(CONFIG, weights, glove)
 
 
+@pytest.fixture(scope="module")
+def sensing_agent(glove):
+    """An agent that senses its way, and goes by it; it mostly moves ahead."""
+    config = dataclasses.replace(CONFIG, network=dataclasses.replace(CONFIG.network, odometry=True))
+    words = glove.table(["Mug", "Bed"])
+    weights = samples.going_by_odometry(make_model(config, Classes()), words)
+    return Agent(config, weights, glove)
+
+
 def detections_of(tables, pose):
     rows = slice(tables.row_start[pose], tables.row_start[pose + 1])
     names = [tables.classes[c] for c in tables.row_class[rows]]
@@ -44,29 +53,91 @@ def detections_of(tables, pose):
     return [Detection(name, *map(float, box)) for name, box in zip(names, boxes, strict=True)]
 
 
-def decide_alike(agent, some_rooms, glove, merge):
-    """The agent and its network in the environment, side by side on a walk."""
+def decide_alike(agent, some_rooms, glove, merge, rotation=0, steps=3):
+    """The agent and its network in the environment, side by side; how often it was stopped."""
     parents = find_parents(some_rooms, TARGETS)
-    params = env.make_params(some_rooms, TARGETS, parents, env.TEST_STEP_LIMITS, merge=merge)
+    params = env.make_params(
+        some_rooms, TARGETS, parents, env.TEST_STEP_LIMITS, merge=merge,
+        odometry=agent.model.odometry,
+    )  # fmt: skip
     model, weights = agent.model, agent.weights
     table = actor_critic.prepare(model, weights, jnp.asarray(glove.table(some_rooms.classes)))
+    observe = jax.jit(jax.vmap(env.observe, (0, None)))
+    transition = jax.jit(jax.vmap(env.transition, (0, 0, None)))
+    forward = jax.jit(actor_critic.forward, static_argnums=0)
+    # It begins where it cannot move ahead.
+    ahead = some_rooms.next_position[:, rotation // 45]
+    position = int(np.flatnonzero(ahead == np.arange(len(ahead)))[9])
     goal = some_rooms.targets.index("Mug")
-    memory, carry, previous = agent.start(), model.initial_carry(1, weights), jnp.zeros((1, 6))
-    for pose in (1001, 1003, 1019):
-        one = jnp.array([pose]), jnp.array([goal])
-        state = jax.vmap(env.start, (None, 0, 0))(params, *one)
-        obs = jax.vmap(env.observe, (0, None))(state, params)
-        fresh = jnp.zeros(1, bool)
-        carry, out = actor_critic.forward(model, weights, table, carry, obs, previous, fresh)
+    one = jnp.array([position * 16 + rotation // 45 * 2]), jnp.array([goal])
+    state = jax.vmap(env.start, (None, 0, 0))(params, *one)
+    carry, previous, fresh = model.initial_carry(1, weights), jnp.zeros((1, 6)), jnp.zeros(1, bool)
+    memory, blocked, stopped = agent.start(rotation), False, 0
+    for key in jax.random.split(jax.random.key(3), steps):
+        obs = observe(state, params)
+        carry, out = forward(model, weights, table, carry, obs, previous, fresh)
         previous = jax.nn.softmax(out.logits)
-        memory, decision = agent.act(memory, detections_of(some_rooms, pose), "Mug")
+        seen, pose = detections_of(some_rooms, int(state.pose[0])), int(state.pose[0])
+        _, greedy = agent.act(memory, seen, "Mug", blocked=blocked)
+        assert greedy.action == Action(int(previous.argmax()))
+        memory, decision = agent.act(memory, seen, "Mug", key, blocked)
         np.testing.assert_allclose(decision.probabilities, previous[0], rtol=1e-4)
         np.testing.assert_allclose(decision.value, out.value[0], rtol=1e-4, atol=1e-6)
-        assert decision.action == Action(int(decision.probabilities.argmax()))
+        assert decision.action == int(jax.random.categorical(key, out.logits)[0])
+        state = transition(state, jnp.array([decision.action]), params).state
+        blocked = decision.action == Action.MOVE_AHEAD and int(state.pose[0]) == pose
+        stopped += blocked
+    return stopped
 
 
-def test_it_decides_as_the_network_does_in_the_environment(agent, some_rooms, glove):
-    decide_alike(agent, some_rooms, glove, merge=False)
+@pytest.mark.parametrize("rotation", [0, 225])
+@pytest.mark.parametrize("senses", [False, True], ids=["plain", "odometry"])
+def test_it_decides_as_the_network_does_in_the_environment(
+    agent, sensing_agent, some_rooms, glove, senses, rotation
+):
+    chosen = sensing_agent if senses else agent
+    steps = 25 if senses else 3
+    stopped = decide_alike(chosen, some_rooms, glove, False, rotation, steps)
+    assert 0 < stopped < steps - 10 or not senses
+
+
+def test_what_an_agent_senses_of_its_way_matters(sensing_agent):
+    seen = [Detection("sink", 0.1, 0.1, 0.3, 0.4)]
+
+    def second(rotation=0, blocked=False, action=Action.MOVE_AHEAD):
+        memory, _ = sensing_agent.act(sensing_agent.start(rotation), seen, "mug")
+        memory = memory._replace(action=jnp.int32(action))
+        return sensing_agent.act(memory, seen, "mug", blocked=blocked)[1].probabilities
+
+    plain = second()
+    for other in (
+        second(rotation=45),
+        second(blocked=True),
+        second(action=Action.ROTATE_LEFT),
+    ):
+        assert np.abs(other - plain).max() > 1e-3
+    np.testing.assert_array_equal(second(rotation=-270), plain)
+    np.testing.assert_array_equal(second(rotation=315), second(rotation=45))
+    # Only a MoveAhead can be blocked.
+    turned = second(action=Action.ROTATE_LEFT, blocked=True)
+    np.testing.assert_array_equal(turned, second(action=Action.ROTATE_LEFT))
+
+
+def test_an_agent_that_senses_nothing_of_its_way_needs_not_be_told(agent):
+    seen = [Detection("sink", 0.1, 0.1, 0.3, 0.4)]
+    assert agent.start(45).trail is None
+    memory, plain = agent.act(agent.start(45), seen, "mug", blocked=True)
+    np.testing.assert_array_equal(
+        plain.probabilities, agent.act(agent.start(), seen, "mug")[1].probabilities
+    )
+    assert memory.trail is None
+
+
+@pytest.mark.parametrize("rotation", [30, -1, 44.5])
+def test_a_rotation_off_the_eight_is_refused(agent, sensing_agent, rotation):
+    for one in (agent, sensing_agent):
+        with pytest.raises(ValueError, match=f"rotation {rotation}: not a multiple of 45"):
+            one.start(rotation)
 
 
 @pytest.fixture(scope="module")

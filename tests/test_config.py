@@ -36,6 +36,7 @@ def test_paper_preset_has_the_reference_constants():
         (TrainConfig(learner=LearnerConfig(gamma=1.5)), "--gamma 1.5"),
         (TrainConfig(network=NetworkConfig(dropout=1.0)), "--dropout 1.0"),
         (TrainConfig(learner=LearnerConfig(learning_rate=float("nan"))), "--learning-rate nan"),
+        (TrainConfig(network=NetworkConfig(odometry=1)), "--odometry 1"),
     ],
 )
 def test_a_value_out_of_range_is_named_in_one_line(config, flag):
@@ -55,6 +56,15 @@ def test_an_unreadable_config_file_is_named(tmp_path, text):
     path.write_text(text)
     with pytest.raises(ValueError, match=re.escape(str(path))):
         configs.load(path)
+
+
+def test_a_run_from_before_odometry_has_none(tmp_path):
+    path = tmp_path / "config.json"
+    values = configs.to_json(TrainConfig())
+    del values["network"]["odometry"]
+    path.write_text(json.dumps(values))
+    assert configs.load(path) == TrainConfig()
+    assert not configs.load(path).network.odometry
 
 
 def test_an_unknown_field_is_refused(tmp_path):

@@ -73,14 +73,20 @@ def house_params() -> EnvParams:
 
 
 PARAMS = house_params()
+#: The same network and task for an agent that senses its way, and for one that does not.
+SENSING = {
+    False: (MODEL, PARAMS),
+    True: (MODEL.clone(odometry=True), PARAMS.replace(odometry=True)),
+}
 begin = jax.jit(learner.init, static_argnums=(1, 2))
 rollout = jax.jit(learner.rollout, static_argnums=(2, 3))
 update = jax.jit(learner.update, static_argnums=(2, 3))
 
 
-def start(seed: int = 0, config: LearnerConfig = CONFIG) -> TrainState:
+def start(seed: int = 0, config: LearnerConfig = CONFIG, senses: bool = False) -> TrainState:
     """A run with parameters that are far from the cautious initial ones."""
-    state = begin(jax.random.key(seed), config, MODEL, WORDS, PARAMS)
+    model, params = SENSING[senses]
+    state = begin(jax.random.key(seed), config, model, WORDS, params)
     leaves, tree = jax.tree.flatten(state.params)
     rng = np.random.default_rng(seed)
     noise = [jnp.asarray(0.3 * rng.normal(size=x.shape), jnp.float32) for x in leaves]
@@ -89,10 +95,14 @@ def start(seed: int = 0, config: LearnerConfig = CONFIG) -> TrainState:
 
 
 @functools.cache
-def example() -> tuple[TrainState, TrainState, Rollout, jax.Array, jax.Array]:
+def example(
+    senses: bool = False,
+) -> tuple[TrainState, TrainState, Rollout, jax.Array, jax.Array]:
     """A state in mid-training, the state after its rollout, the rollout, values, advantages."""
-    before, *_ = rollout(start(), jax.random.key(1), CONFIG, MODEL, WORDS, PARAMS)
-    after, steps, last = rollout(before, jax.random.key(2), CONFIG, MODEL, WORDS, PARAMS)
+    model, params = SENSING[senses]
+    state = start(senses=senses)
+    before, *_ = rollout(state, jax.random.key(1), CONFIG, model, WORDS, params)
+    after, steps, last = rollout(before, jax.random.key(2), CONFIG, model, WORDS, params)
     return before, after, steps, last, advantages_of(steps, last)
 
 
@@ -201,23 +211,59 @@ def test_carries_cross_the_borders_of_rollouts() -> None:
     assert not np.array_equal(after.carry[0], before.carry[0])
 
 
-@jax.jit
-def gradient(state: TrainState, steps: Rollout, advantage: jax.Array, entropy: jax.Array) -> Any:
+@functools.partial(jax.jit, static_argnames="model")
+def gradient(
+    state: TrainState,
+    steps: Rollout,
+    advantage: jax.Array,
+    entropy: jax.Array,
+    model: ActorCritic = MODEL,
+) -> Any:
     """Loss, its parts and its gradient for the parameters that acted."""
 
     def total(params: Any) -> Any:
-        arguments = (steps, advantage, state.carry, entropy, CONFIG, MODEL, WORDS)
+        arguments = (steps, advantage, state.carry, entropy, CONFIG, model, WORDS)
         return learner.loss(params, *arguments)
 
     return jax.value_and_grad(total, has_aux=True)(state.params)
 
 
-def test_the_tape_changes_neither_the_loss_nor_its_gradient() -> None:
-    before, _, steps, _, advantage = example()
-    taped = gradient(before, steps, advantage, 0.01)
-    plain = gradient(before, steps._replace(tape=None), advantage, 0.01)
+@pytest.mark.parametrize("senses", [False, True], ids=["plain", "odometry"])
+def test_the_tape_changes_neither_the_loss_nor_its_gradient(senses: bool) -> None:
+    before, _, steps, _, advantage = example(senses)
+    model, _ = SENSING[senses]
+    taped = gradient(before, steps, advantage, 0.01, model=model)
+    plain = gradient(before, steps._replace(tape=None), advantage, 0.01, model=model)
     # float32 sums over 240 states, in another order.
     chex.assert_trees_all_close(taped, plain, rtol=2e-4, atol=2e-6)
+    if senses:
+        assert "way" in steps.tape
+        assert all(np.asarray(grad).any() for grad in taped[1]["way"].values())
+
+
+def test_what_is_sensed_of_the_way_begins_with_every_episode_and_goes_on_in_it() -> None:
+    _, after, steps, *_ = example(senses=True)
+    whole = jax.tree.map(
+        lambda *x: jnp.concatenate([x[0], x[1][None]]),
+        (steps.obs.odometry, steps.fresh),
+        (jax.vmap(env.observe, (0, None))(after.env_state, SENSING[True][1]).odometry, after.fresh),
+    )
+    sensed, fresh = jax.device_get(whole)  # [T + 1, B]
+    here = np.zeros((9, 9), bool)
+    here[4, 4] = True
+    for t, b in np.ndindex(T + 1, B):
+        place, last = sensed.motion[t, b, :2], sensed.motion[t, b, 6:]
+        if fresh[t, b]:
+            assert not place.any()
+            assert not last.any()
+            np.testing.assert_array_equal(sensed.window[t, b], here)
+        elif t:
+            # Where a time-out waits to be valued, too: the way to the episode's last state.
+            np.testing.assert_array_equal(last, np.eye(6)[steps.action[t - 1, b]])
+            assert sensed.window[t, b][4, 4] & 1
+    assert fresh[1:].sum() > 20
+    assert steps.held.any()
+    assert np.abs(sensed.motion[..., :2]).max() > 0
 
 
 def test_the_loss_is_the_one_that_is_documented() -> None:

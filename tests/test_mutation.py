@@ -28,11 +28,12 @@ class Fault(NamedTuple):
 
 
 ENV, LEARNER, TDANET = "env.py", "learner.py", "models/tdanet.py"
+ODOMETRY = "odometry.py"
 TEST_TDANET = "models/test_tdanet.py"
 FAULTS = (
-    Fault("rotation sign", ENV, "Action.ROTATE_RIGHT, 1, 0", "Action.ROTATE_RIGHT, -1, 0",
+    Fault("rotation sign", ODOMETRY, "Action.ROTATE_RIGHT, 1, 0", "Action.ROTATE_RIGHT, -1, 0",
           "test_env.py"),
-    Fault("impossible look", ENV, "Action.LOOK_UP, 0, horizon",
+    Fault("impossible look", ODOMETRY, "Action.LOOK_UP, 0, horizon",
           "Action.LOOK_UP, 1 - horizon, horizon", "test_env.py"),
     Fault("L without Done", ENV, "astype(jnp.int32) + 1\n", "astype(jnp.int32)\n", "test_env.py"),
     Fault("parent paid twice", ENV, "in_view & ((state.parents_seen & bits) == 0)", "in_view",
@@ -51,6 +52,24 @@ FAULTS = (
           "valid = positions", "test_env.py"),
     Fault("centre of the extent", "detections.py", "first, _rows(centre, ",
           "first, centre_and_area(", "test_env.py"),
+    Fault("headings are not turned", ODOMETRY, "(turned | bits & BLOCKED)",
+          "(stood | bits & BLOCKED)", "test_odometry.py"),
+    Fault("what blocks is where one stands", ODOMETRY, "jnp.where(blocked, ahead, cell)", "cell",
+          "test_odometry.py"),
+    Fault("one visit is remembered", ODOMETRY, "trail.cells[at] | bit", "bit",
+          "test_odometry.py"),
+    Fault("the map ends", ODOMETRY, "[heading]) & (MAP - 1)", "[heading])", "test_odometry.py"),
+    Fault("every start is along an axis", ENV, "begin(rotation & 1,", "begin(rotation & 0,",
+          "test_odometry.py"),
+    Fault("the way goes on in the next episode", LEARNER, "env.choose(over, begun, moved.state)",
+          "env.choose(over, begun, moved.state).replace(trail=moved.state.trail)",
+          "test_learner.py"),
+    Fault("an agent that nothing stops", "agent.py", "memory.action, blocked)",
+          "memory.action, jnp.zeros_like(blocked))", "test_agent.py"),
+    Fault("an agent along an axis", "agent.py", "rotation // 45 % 2", "0 * rotation",
+          "test_agent.py"),
+    Fault("a trace without a way", "trace.py", "env.transition(state, action, params).state",
+          "state.replace(pose=env.move(params, state.pose, action))", "test_trace.py"),
     Fault("share of all rooms", "reward.py", "gaps = gaps[np.isfinite(gaps)]",
           "gaps = gaps[: support]", "test_reward.py"),
     Fault("parents from all rooms", "task.py", "find_parents(seen_rooms", "find_parents(tables",

@@ -89,6 +89,19 @@ def test_models_without_an_image_are_shown_none(ithor: SceneTables, glove: WordV
     assert task.train_params.features is None
 
 
+@pytest.mark.parametrize("senses", [False, True])
+def test_odometry_reaches_the_network_and_both_environments(
+    ithor: SceneTables, glove: WordVectors, senses: bool
+) -> None:
+    network = dataclasses.replace(SMALL, odometry=senses)
+    task = make_task(TrainConfig(network=network), rooms(ithor), glove)
+    assert task.model.odometry == senses
+    for params in (task.train_params, task.eval_params):
+        assert params.odometry == senses
+        obs, state = jax.eval_shape(env.reset, jax.random.key(0), params)
+        assert (obs.odometry is not None) == (state.trail is not None) == senses
+
+
 def test_auto_takes_the_feature_maps_that_lie_beside_the_data(tmp_path) -> None:
     data = tmp_path / "mine.npz"
     config = TrainConfig(model="baseline", network=SMALL, data=str(data))
@@ -121,6 +134,8 @@ def test_feature_maps_need_imported_rooms() -> None:
         ("baseline", NetworkConfig(dropout=0.25, image="raster", hidden=64), []),
         ("savn", NetworkConfig(first_order=True, precision="bfloat16"), ["--precision"]),
         ("my_lab.most_alike", NetworkConfig(image="raster"), []),
+        ("tdanet", NetworkConfig(odometry=True), []),
+        ("savn", NetworkConfig(odometry=True), []),
     ],
 )
 def test_flags_that_change_nothing_are_named(model, network, idle) -> None:

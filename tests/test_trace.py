@@ -19,6 +19,7 @@ from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.trace import Player
 from tdanet_jax.vocabulary import TARGETS, Action
 from tests import oracle
+from tests.conftest import TINY, save_untrained
 from tests.models import equations, samples
 from tests.oracle import Episode, World, pose_of
 
@@ -37,11 +38,22 @@ def one(chosen, i):
     return dataclasses.replace(chosen, pose=chosen.pose[i : i + 1], target=chosen.target[i : i + 1])
 
 
+@pytest.fixture(scope="module")
+def sensing_player(some_rooms, glove, tmp_path_factory):
+    """A player that senses its way."""
+    config = dataclasses.replace(TINY, network=dataclasses.replace(TINY.network, odometry=True))
+    folder = tmp_path_factory.mktemp("runs") / "sensing"
+    save_untrained(config, folder, some_rooms, glove)
+    return trace.load_player(folder, Rooms(some_rooms, None))
+
+
+@pytest.mark.parametrize("who", ["player", "sensing_player"])
 def test_sampled_episodes_come_from_the_probabilities_and_the_stream_of_the_evaluation(
-    some_rooms, player, chosen
+    some_rooms, who, chosen, request
 ):
     """The batch's actions, drawn again from the traces' probabilities with the same keys."""
-    key = jax.random.key(3)
+    player, key = request.getfixturevalue(who), jax.random.key(3)
+    assert player.model.odometry == (who == "sensing_player")
     records = evaluation.evaluate(
         player.policy, player.weights, player.task.eval_params, chosen, key
     )

@@ -46,11 +46,22 @@ def without_times(rows):
 @pytest.fixture(scope="module")
 def whole(task, tmp_path_factory):
     """A run that nothing interrupted."""
-    folder = tmp_path_factory.mktemp("whole")
-    run = Run(folder, TINY, task)
+    return run_whole(tmp_path_factory.mktemp("whole"), TINY, task)
+
+
+def run_whole(folder, config, task):
+    run = Run(folder, config, task)
     rows = list(run.chunks())
     run.save()
     return folder, run, rows
+
+
+@pytest.fixture(scope="module")
+def sensing_whole(ithor, tmp_path_factory):
+    """The same, of an agent that senses its way."""
+    config = dataclasses.replace(TINY, network=dataclasses.replace(TINY.network, odometry=True))
+    task = make_task(config, ithor, words.load_bundled())
+    return run_whole(tmp_path_factory.mktemp("sensing"), config, task)
 
 
 def test_the_budget_in_steps_is_kept_and_every_chunk_has_a_row(whole):
@@ -61,15 +72,19 @@ def test_the_budget_in_steps_is_kept_and_every_chunk_has_a_row(whole):
     assert rows[-1]["episodes"] == int(run.state.episodes) > 0
 
 
-def test_a_stopped_run_goes_on_bit_for_bit(whole, task, tmp_path):
-    stopped = Run(tmp_path, TINY, task)
+@pytest.mark.parametrize("which", ["whole", "sensing_whole"])
+def test_a_stopped_run_goes_on_bit_for_bit(which, tmp_path, request):
+    whole = request.getfixturevalue(which)
+    config, task = whole[1].config, whole[1].task
+    stopped = Run(tmp_path, config, task)
     for count, _ in enumerate(stopped.chunks(), start=1):
         if count == 3:
             stopped.save()
         if count == 5:  # two chunks behind the checkpoint are lost
             break
-    again = Run(tmp_path, TINY, task)
+    again = Run(tmp_path, config, task)
     assert again.steps == 240
+    assert (again.state.env_state.trail is not None) == (which == "sensing_whole")
     list(again.chunks())
     for ours, theirs in zip(leaves(again.state), leaves(whole[1].state), strict=True):
         np.testing.assert_array_equal(ours, theirs)

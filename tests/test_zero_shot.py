@@ -28,12 +28,14 @@ SPLITS = [("18/4", False), ("14/8", False), ("18/4", True)]
 NAMES = ["18/4", "14/8", "18/4-validation"]
 
 
-def config_of(split: str, validation: bool, rows: Any = "class") -> TrainConfig:
+def config_of(
+    split: str, validation: bool, rows: Any = "class", odometry: bool = False
+) -> TrainConfig:
     return TrainConfig(
         split=split,
         validation=validation,
         learner=LearnerConfig(num_envs=16, rollout_steps=8, step_limit=6),
-        network=NetworkConfig(width=8, hidden=8, rows=rows),
+        network=NetworkConfig(width=8, hidden=8, rows=rows, odometry=odometry),
     )
 
 
@@ -164,11 +166,11 @@ def training_walk(params: env.EnvParams) -> tuple[Any, ...]:
 
 
 @pytest.mark.parametrize("split", SPLITS, ids=NAMES)
-@pytest.mark.parametrize("rows", ["class", "object"])
+@pytest.mark.parametrize(("rows", "odometry"), [("class", False), ("object", True)])
 def test_perturbing_all_hidden_data_changes_nothing_that_training_reads(
-    rooms: SceneTables, glove: WordVectors, split: tuple[str, bool], rows: str
+    rooms: SceneTables, glove: WordVectors, split: tuple[str, bool], rows: str, odometry: bool
 ) -> None:
-    config = config_of(*split, rows=rows)
+    config = config_of(*split, rows, odometry)
     hidden = make_split(*split).hidden
     task = make_task(config, rooms, glove)
     noisy = perturbed(rooms, hidden, seed=1)

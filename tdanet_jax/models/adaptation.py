@@ -14,8 +14,9 @@ respect to the product, so that
 and an environment keeps the pairs (x_t, d_t) of its inner steps instead of a matrix. For the small
 dense layers around the LSTM it keeps its own part of the parameters as it is (`layers.OWN`).
 What an encoder takes once for all environments (`prepare`), layers that it shares among them
-(`Encoder.SHARED`), and dense layers of over 65,536 weights, are not adapted; SAVN has none of the
-latter two. A test compares with plain per-environment parameters, in value and in gradient.
+(`Encoder.SHARED`), dense layers of over 65,536 weights, and the layer that reads the odometry, are
+not adapted; SAVN as published has none of the latter three. A test compares with plain
+per-environment parameters, in value and in gradient.
 
 In training, all environments take their inner steps together, after every k steps of a rollout: an
 episode adapts for the first time where such a stretch of k steps first lies within it, and a
@@ -39,7 +40,7 @@ from tdanet_jax.models.actor_critic import ActorCritic, Output
 from tdanet_jax.models.layers import OWN, clear, lstm_cell, paired_product, product
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
-#: The parts of the network, beside the LSTM, that the learned loss depends on.
+#: The parts of the network, beside the LSTM, that are adapted.
 PARTS = ("action_embedding", "encoder", "actor")
 #: Most weights of a dense layer that every environment adapts for itself.
 SMALL = 2**16
@@ -165,7 +166,7 @@ class AdaptiveActorCritic(ActorCritic):
 
     def view(self, obs: Observation) -> Observation:
         """What of the observations the network uses, in shapes that are the same for all frames."""
-        return self.encoder.view(obs).replace(odometry=obs.odometry)
+        return self.encoder.view(obs).replace(odometry=obs.odometry if self.odometry else None)
 
     def recall(self, hidden: jax.Array) -> jax.Array:
         """The learned loss [B] of k hidden states [B, k, H]."""

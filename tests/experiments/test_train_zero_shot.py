@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+import tdanet_jax
 from experiments import train_zero_shot
 from tdanet_jax import files
 from tests.experiments import command
@@ -65,9 +66,12 @@ def test_it_trains_evaluates_and_goes_on_after_kill_and_term(ithor, tmp_path, ca
 
 
 def test_two_processes_train_together_and_one_goes_on_alone(ithor, tmp_path):
-    """The environments of one run in two processes; what they saved, one process goes on with."""
+    """The environments of one run in two processes; what they saved, one process goes on with.
+
+    With odometry: every environment has a map of its own.
+    """
     out = tmp_path / "run"
-    arguments = ["--steps", "2400", "--devices", "2", *command.TINY, "--out", out]
+    arguments = ["--steps", "2400", "--devices", "2", "--odometry", *command.TINY, "--out", out]
     port = free_port()
     both = [
         command.start(
@@ -90,7 +94,10 @@ def test_two_processes_train_together_and_one_goes_on_alone(ithor, tmp_path):
 
     done = command.run("train_zero_shot", "--resume", out, "--steps", "3200")
     assert done.returncode == 0, done.stderr
-    assert json.loads((out / "config.json").read_text())["steps"] == 3200
+    config = json.loads((out / "config.json").read_text())
+    assert config["steps"] == 3200
+    assert config["network"]["odometry"]
+    assert tdanet_jax.load(out).start(45).trail is not None
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 8
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from tdanet_jax.env import FEATURES, RASTER, Observation
 from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.odometry import Odometry
 
 CLASSES, WIDTH, DETECTIONS = 9, 5, 6  # C, D, K
 
@@ -50,9 +51,27 @@ def one_per_class(obs: Observation, seed: int = 3) -> Observation:
     )
 
 
+def odometry(*shape: int, seed: int = 4) -> Odometry:
+    """What agents might sense of their way, in [*shape]."""
+    rng = np.random.default_rng(seed)
+    bits = rng.random((*shape, 9, 9, 9)) < 0.1
+    return Odometry(
+        motion=jnp.asarray(rng.normal(size=(*shape, 12)), jnp.float32),
+        window=jnp.asarray((bits << np.arange(9)).sum(-1), jnp.uint16),
+    )
+
+
 def parameters(model: ActorCritic, words: Any, seed: int = 2) -> Any:
     """Random parameters of a network; its own initialisers take seconds to compile."""
     return randomised(jax.eval_shape(model.initialise, jax.random.key(0), words), seed)
+
+
+def going_by_odometry(model: ActorCritic, words: Any) -> Any:
+    """Random parameters of a network that senses its way, mostly moves ahead and rarely ends."""
+    weights = parameters(model, words)
+    weights["way"]["kernel"] *= 5.0  # most of its inputs are zero
+    weights["actor"]["bias"] = jnp.array([2.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+    return weights
 
 
 def randomised(params: Any, seed: int = 2) -> Any:

@@ -38,24 +38,26 @@ CLOSE = {"rtol": 1e-3, "atol": 1e-4}  # float32 sums of thousands of products, t
 
 
 @functools.cache
-def parameters() -> Any:
-    params = samples.parameters(MODEL, WORDS)
+def parameters(model: AdaptiveActorCritic = MODEL) -> Any:
+    params = samples.parameters(model, WORDS)
     # Gates that are not saturated: 3,136 features go into each.
     lstm = {name: 0.3 * value for name, value in params["lstm"].items()}
     return {**params, "lstm": lstm}
 
 
-def inputs() -> tuple[Any, ...]:
+def inputs(senses: bool = False) -> tuple[Any, ...]:
     """Observations, previous probabilities, episode starts and dropout of a rollout."""
     rng = np.random.default_rng(0)
     previous = np.where(FRESH[..., None], 0, rng.dirichlet(np.ones(6), (T, B)))
     keep = jnp.asarray(rng.random((T, B, DROPOUT_UNITS)) < 0.75)
     obs = samples.observations(T, B)
+    if senses:
+        obs = obs.replace(odometry=samples.odometry(T, B))
     return obs, jnp.asarray(previous, jnp.float32), jnp.asarray(FRESH), keep
 
 
-def start(params: Any, batch: int = B) -> Memory:
-    return MODEL.initial_carry(batch, params, training=True)
+def start(params: Any, batch: int = B, model: AdaptiveActorCritic = MODEL) -> Memory:
+    return model.initial_carry(batch, params, training=True)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -155,10 +157,31 @@ def slow_rollout(params: Any, given: Any, first_order: bool = False, **network: 
     return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), out)
 
 
-def test_values_are_those_of_plain_per_environment_parameters() -> None:
-    given = jax.tree.map(lambda x: x[:3], inputs())  # a stretch, and one step behind it
-    _, out = play(MODEL, parameters(), start(parameters()), given)
-    chex.assert_trees_all_close(out, jax.jit(slow_rollout)(parameters(), given), **CLOSE)
+#: What an environment does not adapt for itself: the layer that reads the odometry.
+NOT_ADAPTED = ("way",)
+
+
+@pytest.mark.parametrize("senses", [False, True], ids=["plain", "odometry"])
+def test_values_are_those_of_plain_per_environment_parameters(senses: bool) -> None:
+    model, plain = MODEL.clone(odometry=senses), PLAIN.clone(odometry=senses)
+    params = parameters(model)
+    given = jax.tree.map(lambda x: x[:3], inputs(senses))  # a stretch, and one step behind it
+    _, out = play(model, params, start(params, model=model), given)
+    slow = functools.partial(slow_rollout, plain=plain, shared=NOT_ADAPTED)
+    chex.assert_trees_all_close(out, jax.jit(slow)(params, given), **CLOSE)
+    if senses:
+        still = given[0].replace(odometry=jax.tree.map(jnp.zeros_like, given[0].odometry))
+        _, other = play(model, params, start(params, model=model), (still, *given[1:]))
+        assert np.all(np.abs(out.logits - other.logits).max(-1) > 1e-4)
+
+
+def test_what_a_network_does_not_use_of_the_observations_is_not_remembered() -> None:
+    """The environment may hold odometry for another network's sake."""
+    given = jax.tree.map(lambda x: x[0], inputs(senses=True))
+    params = parameters()
+    _, out = play(MODEL, params, start(params), given)
+    _, plain = play(MODEL, params, start(params), jax.tree.map(lambda x: x[0], inputs()))
+    chex.assert_trees_all_equal(out, plain)
 
 
 @pytest.mark.slow

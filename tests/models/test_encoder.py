@@ -7,19 +7,24 @@ import sys
 import types
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tdanet_jax import learner
 from tdanet_jax.classes import Classes
-from tdanet_jax.config import MODELS, NetworkConfig, TrainConfig
+from tdanet_jax.config import MODELS, LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.env import Observation
 from tdanet_jax.models import actor_critic
-from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.actor_critic import ODOMETRY_UNITS, ActorCritic
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import TAPE, Linear
-from tdanet_jax.task import make_model
+from tdanet_jax.odometry import numbers
+from tdanet_jax.scenes import SceneTables
+from tdanet_jax.task import make_model, make_task
+from tdanet_jax.words import WordVectors
 from tests.models import samples
 
 B = 3
@@ -112,6 +117,11 @@ def test_no_array_of_a_model_is_empty(name: str) -> None:
         assert leaf.size, jax.tree_util.keystr(path)
 
 
+def sensing(config: TrainConfig) -> TrainConfig:
+    """The same for an agent that senses its way."""
+    return dataclasses.replace(config, network=dataclasses.replace(config.network, odometry=True))
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_every_named_model_is_made_and_answers(name: str) -> None:
     names = tuple(f"Class{i}" for i in range(samples.CLASSES))
@@ -127,6 +137,62 @@ def test_every_named_model_is_made_and_answers(name: str) -> None:
     out = jax.jit(answer)(jax.random.key(0))
     assert out.logits.shape == (B, 6)
     assert np.isfinite(out.logits).all()
+
+
+def test_the_odometry_stands_behind_the_encoders_features_and_leaves_them_alone() -> None:
+    plain, model = ActorCritic(Plain(), hidden=6), ActorCritic(Plain(), hidden=6, odometry=True)
+    weights = samples.parameters(model, WORDS)
+    obs = samples.observations(2, B).replace(odometry=samples.odometry(2, B))
+    arguments = WORDS, obs, jnp.zeros((2, B, 6)), None
+    alone, _ = plain.apply({"params": {}}, *arguments, method="perceive")
+    features, aside = model.apply({"params": weights}, *arguments, method="perceive")
+    assert aside.shape == (2, B, 6)
+    assert features.shape == (2, B, alone.shape[-1] + ODOMETRY_UNITS)
+    np.testing.assert_array_equal(features[..., : alone.shape[-1]], alone)
+    way = weights["way"]
+    product = numbers(obs.odometry) @ way["kernel"] + way["bias"]
+    expected = np.maximum(product, 0)
+    np.testing.assert_allclose(features[..., alone.shape[-1] :], expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_named_model_takes_odometry(name: str) -> None:
+    names = tuple(f"Class{i}" for i in range(samples.CLASSES))
+    config = sensing(dataclasses.replace(SMALL, model=name))
+    model = make_model(config, Classes(names, tuple(range(7))))
+    obs = samples.one_per_class(samples.observations(2, B)).replace(odometry=samples.odometry(2, B))
+
+    def answer(obs: Observation) -> Any:
+        weights = model.initialise(jax.random.key(0), WORDS)
+        table = actor_critic.prepare(model, weights, WORDS)
+        state = model.initial_carry(B, weights), obs, jnp.zeros((2, B, 6)), jnp.ones((2, B), bool)
+        return weights, actor_critic.forward(model, weights, table, *state)[1]
+
+    with pytest.raises(ValueError, match="senses its way, and the observations do not hold it"):
+        jax.eval_shape(answer, obs.replace(odometry=None))
+    weights, out = jax.eval_shape(answer, obs)
+    assert out.logits.shape == (2, B, 6)
+    assert weights["way"]["kernel"].shape == (741, ODOMETRY_UNITS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MODELS)
+def test_every_named_model_learns_with_odometry(
+    name: str, some_rooms: SceneTables, glove: WordVectors
+) -> None:
+    learning = LearnerConfig(num_envs=4, rollout_steps=7, step_limit=5)  # an inner step, and resets
+    config = sensing(dataclasses.replace(SMALL, model=name, learner=learning))
+    task = make_task(config, some_rooms, glove)
+    state = learner.init(
+        jax.random.key(0), learning, task.model, task.train_words, task.train_params
+    )
+    state = state.replace(params=samples.randomised(state.params))
+    before = jax.device_get(state.params)
+    chunk = learner.make_train(learning, task.model, 1)
+    state, metrics = chunk(state, jnp.zeros(2), task.train_words, task.train_params)
+    assert int(state.skipped) == 0
+    chex.assert_tree_all_finite((state.params, metrics))
+    assert not np.array_equal(state.params["way"]["kernel"], before["way"]["kernel"])
 
 
 def test_a_module_of_the_users_own_is_a_model(monkeypatch: pytest.MonkeyPatch) -> None:
