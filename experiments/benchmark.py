@@ -80,6 +80,8 @@ def main(arguments: list[str] | None = None) -> None:
         )
         for name in command.models:
             TrainConfig(model=name).check()
+        if command.odometry and not {"rollout", "update", "decision"} & set(command.parts):
+            fail("--odometry: none of the --parts has a model; choose rollout, update or decision")
         if command.checkpoint is not None:
             from tdanet_jax import saved
 
@@ -131,7 +133,7 @@ def figures(command: Command) -> Iterator[Row]:
             yield measure.evaluation_row(command.checkpoint, task, networks, command.repeats)
     for name in command.models:
         for row in model_rows(command, name, peak):
-            yield {"part": row.pop("part"), "model": name, **row}
+            yield {"part": row.pop("part"), "model": name, "odometry": command.odometry, **row}
 
 
 def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]:
@@ -269,8 +271,8 @@ def as_table(rows: list[Row]) -> Table:
     """All rows as one table: the part, its setting, and its figures."""
     table = Table("part", "setting", "figures")
     settings = (
-        "environments", "devices", "observations", "precision", "model", "batch", "networks",
-        "episodes",
+        "environments", "devices", "observations", "precision", "model", "odometry", "batch",
+        "networks", "episodes",
     )  # fmt: skip
     for row in rows:
         setting = ", ".join(f"{k} {row[k]}" for k in settings if k in row)

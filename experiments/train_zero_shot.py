@@ -181,8 +181,9 @@ def how_to_go_on(folder: Path) -> str:
 
 
 def title(run: Run) -> str:
-    """tdanet, split 18/4, seed 0."""
-    return f"{run.config.model}, split {run.task.split.name}, seed {run.config.seed}"
+    """tdanet, split 18/4, seed 0; or tdanet, --odometry, ..."""
+    sensing = ", --odometry" if run.model.odometry else ""
+    return f"{run.config.model}{sensing}, split {run.task.split.name}, seed {run.config.seed}"
 
 
 def learn(run: Run, tensorboard: bool, stop: StopRequest) -> None:
@@ -283,6 +284,7 @@ def report_on(run: Run, lists: Mapping[str, Episodes]) -> None:
         data_version=task.tables.data_version,
         data=run.config.data,
         image=task.image,
+        odometry=task.model.odometry,
     )
     print_summary(report.write(run.folder, provenance, task.tables, played))
     console.print(f"wrote {run.folder / 'results.md'}")

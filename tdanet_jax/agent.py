@@ -18,7 +18,7 @@ import numpy as np
 
 from tdanet_jax import classes as vocabularies
 from tdanet_jax import config as configs
-from tdanet_jax import history
+from tdanet_jax import history, odometry
 from tdanet_jax import words as word_vectors
 from tdanet_jax.checkpoint import FOLDER, Checkpoints
 from tdanet_jax.classes import Classes
@@ -28,13 +28,15 @@ from tdanet_jax.env import Observation
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output
 from tdanet_jax.models.layers import Carry
-from tdanet_jax.odometry import Trail, begin, follow, sense
+from tdanet_jax.odometry import Trail
 from tdanet_jax.task import make_model
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action, class_words
 from tdanet_jax.words import WordVectors
 
 #: Rows and labels are padded to multiples of these, so that few shapes are ever compiled.
 ROW_BLOCK, LABEL_BLOCK = 16, 64
+#: Degrees by which a simulator may miss a multiple of 45.
+TOLERANCE = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,24 +99,30 @@ class Agent:
         self._table: Any = None
         self._decide = jax.jit(self._forward)
 
-    def start(self, rotation: int = 0) -> Memory:
-        """The memory at the start of an episode, looking level.
+    def start(self, rotation: float = 0, horizon: float = 0) -> Memory:
+        """The memory at the start of an episode.
 
         Args:
           rotation: degrees, a multiple of 45; multiples of 90 lie along the grid on which the agent
             moves. Only networks that sense their way (`--odometry`) need it.
+          horizon: degrees, 0 or 30, looking down; likewise.
 
         Raises:
-          ValueError: the rotation is no multiple of 45.
+          ValueError: the rotation is no multiple of 45, or the horizon neither 0 nor 30.
         """
-        if rotation % 45:
+        eighths = round(rotation / 45)
+        if abs(rotation - 45 * eighths) > TOLERANCE:
             raise ValueError(f"rotation {rotation}: not a multiple of 45 degrees")
-        diagonal = jnp.int32(rotation // 45 % 2)
+        if min(abs(horizon), abs(horizon - 30)) > TOLERANCE:
+            raise ValueError(f"horizon {horizon}: neither 0 nor 30 degrees")
+        trail = None
+        if self.model.odometry:
+            trail = odometry.begin(jnp.int32(eighths % 2), jnp.int32(horizon > 15))
         return Memory(
             carry=self.model.initial_carry(1, self.weights),
             previous=jnp.zeros((1, NUM_ACTIONS)),
             action=jnp.int32(NUM_ACTIONS),
-            trail=begin(diagonal, jnp.int32(0)) if self.model.odometry else None,
+            trail=trail,
         )
 
     def act(
@@ -123,7 +131,7 @@ class Agent:
         detections: Sequence[Detection],
         target: str,
         key: jax.Array | None = None,
-        blocked: bool = False,
+        blocked: bool | None = None,
     ) -> tuple[Memory, Decision]:
         """One step.
 
@@ -136,20 +144,24 @@ class Agent:
           detections: the objects in view, in any order.
           target: what to look for, in English.
           key: samples the action, as in training; None takes the most probable one.
-          blocked: whether the action before was a MoveAhead that did not move the agent (AI2-THOR's
-            `lastActionSuccess` was False). Only networks that sense their way need it.
+          blocked: whether the agent did not move in the action before (AI2-THOR's
+            `lastActionSuccess` was False). Networks that sense their way need it behind a
+            MoveAhead, and behind no other action.
 
         Raises:
           KeyError: a label has a word without a word vector.
-          ValueError: the model looks at an image, and not at detections.
+          ValueError: the model looks at an image, and not at detections; or it senses its way and
+            is not told whether its MoveAhead was blocked.
         """
         if self.model.encoder.IMAGE:
             raise ValueError(
                 f"{self.config.model} looks at an image; an agent is shown detections alone"
             )
+        if memory.trail is not None and blocked is None and memory.action == Action.MOVE_AHEAD:
+            raise ValueError("the agent senses its way: say whether its MoveAhead was `blocked`")
         obs, owner = self._observe(detections, target)
         memory, out, attention = self._decide(
-            self.weights, self._prepared(), memory, obs, jnp.asarray(blocked)
+            self.weights, self._prepared(), memory, obs, jnp.asarray(bool(blocked))
         )
         logits, value = out
         best = jnp.argmax(logits, -1) if key is None else jax.random.categorical(key, logits)
@@ -213,8 +225,8 @@ class Agent:
         """What the network says and attends to, and the memory behind it but for the action."""
         trail = memory.trail
         if trail is not None:
-            trail = follow(trail, memory.action, blocked)
-            obs = obs.replace(odometry=jax.tree.map(lambda x: x[None], sense(trail)))
+            trail = odometry.follow(trail, memory.action, blocked)
+            obs = obs.replace(odometry=jax.tree.map(lambda x: x[None], odometry.sense(trail)))
         variables = {"params": weights}
         attention: Any = self.model.apply(variables, table, obs, method="attention")
         carry, out = actor_critic.forward(

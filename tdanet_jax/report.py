@@ -45,6 +45,7 @@ class Provenance:
       data_version: of the scene tables that it was evaluated on.
       data: file of their rooms, where they are not the bundled ones.
       image: what the model sees, if it looks at an image.
+      odometry: whether it senses its own way, which the paper's agents do not.
     """
 
     split: str
@@ -57,6 +58,7 @@ class Provenance:
     data_version: str
     data: str | None = None
     image: str | None = None
+    odometry: bool = False
 
 
 def columns(tables: SceneTables, episodes: Episodes, records: Records) -> dict[str, np.ndarray]:
@@ -175,8 +177,9 @@ def all_rows(
 
 def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarray]]) -> str:
     """`results.md`: the tables of the paper's form, with the paper's rows beside ours."""
+    agent = f"{out['model']}, --odometry" if out["odometry"] else out["model"]
     lines = [
-        f"# {out['model']}, split {out['split']}, seed {out['seed']}",
+        f"# {agent}, split {out['split']}, seed {out['seed']}",
         "",
         f"{out['episodes_trained']:,} training episodes, {out['steps']:,} environment steps; "
         f"{out['policy']} actions, evaluation seed {out['evaluation_seed']}; scene tables "
@@ -190,7 +193,7 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarra
     for group in GROUPS:
         if out[group] is None:
             continue
-        lines.append(_row((group, f"**{out['model']} (ours)**"), out[group]))
+        lines.append(_row((group, f"**{agent} (ours)**"), out[group]))
         lines += [_paper_row(group, *row) for row in paper.rates(out["split"], group)]
     if any(rate.split == out["split"] for rate in paper.RATES):
         lines += ["", paper.worlds(out["data"])]

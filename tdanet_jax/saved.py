@@ -179,4 +179,5 @@ def _provenance(
         data_version=task.tables.data_version,
         data=network.rooms,
         image=task.image,
+        odometry=task.model.odometry,
     )

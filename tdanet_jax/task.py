@@ -253,7 +253,7 @@ def make_model(config: TrainConfig, classes: Classes) -> ActorCritic:
     """The network of a configuration.
 
     Raises:
-      ValueError: `config.model` names a module that cannot be imported or makes no model.
+      ValueError: `config.model` names a module that cannot be imported or makes no `ActorCritic`.
     """
     module_name, options = MODELS.get(config.model, (config.model, {}))
     try:
@@ -264,5 +264,7 @@ def make_model(config: TrainConfig, classes: Classes) -> ActorCritic:
         raise ValueError(f"--model {config.model}: the module has no function `make`")
     network = config.network
     dtype = jnp.dtype(resolve_precision(network).precision)
-    model: ActorCritic = module.make(network, classes, dtype, **options)
-    return model.clone(odometry=network.odometry)
+    model = module.make(network, classes, dtype, **options)
+    if not isinstance(model, ActorCritic):
+        raise ValueError(f"--model {config.model}: `make` gives no ActorCritic")
+    return model.clone(odometry=True) if network.odometry else model

@@ -133,6 +133,23 @@ def test_an_agent_that_senses_nothing_of_its_way_needs_not_be_told(agent):
     assert memory.trail is None
 
 
+def test_an_agent_that_senses_its_way_must_be_told_whether_its_move_was_blocked(sensing_agent):
+    seen = [Detection("sink", 0.1, 0.1, 0.3, 0.4)]
+    memory, _ = sensing_agent.act(sensing_agent.start(), seen, "mug")
+    moved = memory._replace(action=jnp.int32(Action.MOVE_AHEAD))
+    with pytest.raises(ValueError, match="whether its MoveAhead was `blocked`"):
+        sensing_agent.act(moved, seen, "mug")
+    turned = memory._replace(action=jnp.int32(Action.ROTATE_LEFT))
+    sensing_agent.act(turned, seen, "mug")
+
+
+def test_a_start_that_looks_down_is_sensed(sensing_agent):
+    assert int(sensing_agent.start(horizon=30).trail.horizon) == 1
+    assert int(sensing_agent.start(45.0001, 0.0).trail.heading) == 1
+    with pytest.raises(ValueError, match="horizon 15: neither 0 nor 30"):
+        sensing_agent.start(horizon=15)
+
+
 @pytest.mark.parametrize("rotation", [30, -1, 44.5])
 def test_a_rotation_off_the_eight_is_refused(agent, sensing_agent, rotation):
     for one in (agent, sensing_agent):

@@ -114,6 +114,12 @@ def test_other_rooms_or_actions_are_apart():
     assert comparison.labels(results, "ab") == ["tdanet", "tdanet"]
 
 
+def test_that_an_agent_senses_its_way_is_always_said():
+    sensing = [of(seed, network=NetworkConfig(odometry=True)) for seed in (0, 1)]
+    assert comparison.labels(sensing, "ab") == ["tdanet, --odometry"] * 2
+    assert comparison.labels([of(0), of(1)], "ab") == ["tdanet"] * 2
+
+
 def test_twice_the_same_seed_is_no_sample_of_seeds():
     results = [of(0), of(1), of(0, 60.0)]
     assert comparison.labels(results, "abc") == ["tdanet, a", "tdanet, b", "tdanet, c"]

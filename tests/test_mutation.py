@@ -66,7 +66,7 @@ FAULTS = (
           "test_learner.py"),
     Fault("an agent that nothing stops", "agent.py", "memory.action, blocked)",
           "memory.action, jnp.zeros_like(blocked))", "test_agent.py"),
-    Fault("an agent along an axis", "agent.py", "rotation // 45 % 2", "0 * rotation",
+    Fault("an agent along an axis", "agent.py", "eighths % 2", "0 * eighths",
           "test_agent.py"),
     Fault("a trace without a way", "trace.py", "env.transition(state, action, params).state",
           "state.replace(pose=env.move(params, state.pose, action))", "test_trace.py"),

@@ -13,7 +13,8 @@ from tdanet_jax.vocabulary import ALL_TARGETS
 BUCKET = {"SR", "SPL", "SR_ci", "SPL_ci", "n"}
 TOP = [
     "version", "split", "model", "policy", "episodes_trained", "seen", "unseen", "by_room",
-    "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "commit",
+    "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "odometry",
+    "commit",
 ]  # fmt: skip
 
 
@@ -62,6 +63,16 @@ def test_the_report_says_how_it_can_be_made_again(played, ithor, tmp_path):
     page = (tmp_path / "results.md").read_text()
     assert "sample actions, evaluation seed 7;" in page
     assert "\nData: rooms.npz.\nImage: a map.\n" in page
+
+
+def test_the_report_says_that_an_agent_senses_more_than_the_papers(played, ithor, tmp_path):
+    shown = report.Provenance(
+        "18/4", "tdanet", "sample", 1, 0, 7, 2, ithor.data_version, odometry=True
+    )
+    assert report.write(tmp_path, shown, ithor, played)["odometry"] is True
+    page = (tmp_path / "results.md").read_text()
+    assert page.startswith("# tdanet, --odometry, split 18/4")
+    assert "| **tdanet, --odometry (ours)** |" in page
 
 
 def test_percentages_run_from_0_to_100_and_an_empty_bucket_is_null(written):

@@ -36,7 +36,7 @@ def split(pose: Integers) -> Pose:
 
 
 def join(position: Integers, rotation: Integers = 0, horizon: Integers = 0) -> Integers:
-    """Poses from their parts; without a position, the number of a view at any of them."""
+    """Poses from their parts; with position 0, the number of a view at any of them."""
     return (position * ROTATIONS + rotation) * HORIZONS + horizon
 
 

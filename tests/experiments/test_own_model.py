@@ -10,6 +10,9 @@ import pytest
 
 import tdanet_jax
 from tdanet_jax.agent import Detection
+from tdanet_jax.classes import Classes
+from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.task import make_model
 from tests.experiments import command
 from tests.experiments.pages import block
 
@@ -38,3 +41,12 @@ def test_the_example_on_the_page_is_a_model(
     assert sum(decision.probabilities) == pytest.approx(1, abs=1e-5)
     _, other = agent.act(agent.start(), seen[:1], target="toaster")
     assert other.value != decision.value
+
+
+def test_a_module_that_makes_no_model_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "no_model.py").write_text("def make(config, classes, dtype):\n    return 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    for odometry in (False, True):
+        config = TrainConfig(model="no_model", network=NetworkConfig(odometry=odometry))
+        with pytest.raises(ValueError, match="--model no_model: `make` gives no ActorCritic"):
+            make_model(config, Classes())
