@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import signal
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,10 @@ from tests.models import samples
 # No deadline: tests do not time anything. Derandomised: the same examples on every run.
 settings.register_profile("tests", deadline=None, derandomize=True, database=None)
 settings.load_profile("tests")
+
+# Tests that a script starts in the background ignore Ctrl-C, and so would the commands they stop.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # What one test or command has compiled, the next one need not, in whichever process: for this
 # session alone. The workers of pytest-xdist inherit the folder; a limit of its size brings locks.

@@ -1,16 +1,20 @@
-"""Progress where there is no terminal: few lines, with the time left. Signals that are dropped."""
+"""Progress where there is no terminal: few lines, with the time left. Signals."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
-from experiments import console
+from experiments import console, evaluate
 
 
 @pytest.fixture
@@ -47,29 +51,133 @@ def test_a_slow_report_is_a_line_each(
     assert capsys.readouterr().out.splitlines() == ["training  25.0 %"] * 3
 
 
+def strike() -> None:
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
 class Struck:
     """A signal comes when it is collected, where Python drops whatever is raised."""
 
     def __del__(self) -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
+        strike()
 
 
 def drop() -> None:
     """As a library that drops what is raised below it."""
     with contextlib.suppress(BaseException):
-        os.kill(os.getpid(), signal.SIGTERM)
+        strike()
 
 
-@pytest.mark.parametrize("dropped", [Struck, drop])
+def drop_in_a_thread() -> None:
+    """As a library that keeps what is raised below it until a thread of its own is done."""
+    kept: list[BaseException] = []
+    try:
+        strike()
+    except BaseException as error:
+        kept.append(error)
+    thread = threading.Thread(target=kept.clear)
+    thread.start()
+    thread.join()
+
+
+def status(body: Callable[[], object], seconds: float = 2.0) -> int | str | None:
+    """The exit status of a command that waits after `body`; None if it runs to its end."""
+    try:
+        with console.one_line_errors():
+            body()
+            time.sleep(seconds)
+    except SystemExit as stopped:
+        return stopped.code
+    return None
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Imports a module of the given text."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("sys.dont_write_bytecode", True)
+
+    def load(text: str) -> None:
+        name = f"written_by_{tmp_path.name}"
+        (tmp_path / f"{name}.py").write_text(text)
+        importlib.invalidate_caches()
+        monkeypatch.delitem(importlib.sys.modules, name, raising=False)
+        importlib.import_module(name)
+
+    return load
+
+
+@pytest.fixture
+def heard() -> Iterator[list[int]]:
+    """The signals that came to somebody else's handlers."""
+    numbers: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, _: numbers.append(number))
+        for number in (signal.SIGTERM, signal.SIGALRM)
+    }
+    yield numbers
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("dropped", [Struck, drop, drop_in_a_thread])
 def test_a_stop_that_is_dropped_comes_again(
     dropped: Callable[[], object], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def command() -> None:
-        with console.one_line_errors():
-            dropped()
-            time.sleep(10)
-
-    with pytest.raises(SystemExit) as stopped:
-        command()
-    assert stopped.value.code == 128 + signal.SIGTERM
+    assert status(dropped) == 128 + signal.SIGTERM
     assert capsys.readouterr().err == "stopped\n"
+
+
+STRIKE = "from tests.experiments.test_console import status, strike\n"
+
+
+def test_a_signal_waits_for_an_import_but_a_second_one_does_not(
+    module: Callable[[str], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = STRIKE + "strike()\nimport time; time.sleep(0.2)\nprint('once')\n"
+    assert status(lambda: module(text)) == 128 + signal.SIGTERM
+    assert capsys.readouterr() == ("once\n", "stopped\n")
+    assert status(lambda: module(text + "strike()\nprint('twice')")) == 128 + signal.SIGTERM
+    assert capsys.readouterr() == ("once\n", "stopped\n")
+
+
+def test_a_command_that_an_imported_script_calls_is_stopped(
+    module: Callable[[str], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    module(STRIKE + "print(status(strike))")
+    assert capsys.readouterr() == (f"{128 + signal.SIGTERM}\n", "stopped\n")
+
+
+def test_what_waits_at_the_end_goes_to_whoever_had_the_signals(
+    module: Callable[[str], None], heard: list[int]
+) -> None:
+    handlers = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGALRM)]
+    assert status(lambda: module(STRIKE + "strike()"), seconds=0.0) is None
+    assert heard == [signal.SIGTERM]
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert handlers == [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGALRM)]
+
+
+def test_somebody_elses_alarm_rings(heard: list[int]) -> None:
+    assert status(lambda: signal.setitimer(signal.ITIMER_REAL, 0.05), seconds=0.1) is None
+    assert heard == [signal.SIGALRM]
+
+
+def test_a_signal_that_is_ignored_stays_so() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert status(lambda: signal.raise_signal(signal.SIGINT), seconds=0.0) is None
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_command_runs_in_a_thread(capsys: pytest.CaptureFixture[str]) -> None:
+    with ThreadPoolExecutor() as pool:
+        error = pool.submit(
+            evaluate.main, ["--policy", "random", "--checkpoint", "run"]
+        ).exception()
+    assert isinstance(error, SystemExit)
+    assert error.code == 2
+    assert capsys.readouterr().err == "error: --policy random takes no --checkpoint\n"

@@ -9,10 +9,12 @@ import contextlib
 import json
 import os
 import resource
+import shlex
 import shutil
 import signal
 import struct
 import subprocess
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -215,6 +217,29 @@ def test_ctrl_c_ends_a_command_that_has_not_begun_without_a_word(tmp_path: Path)
     path = {"PYTHONPATH": os.pathsep.join((str(tmp_path), os.getcwd()))}
     done = command.run("evaluate", "--help", variables=path)
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+def in_shell(tmp_path: Path, line: str, name: str, sent: int) -> tuple[int, str, str]:
+    """Exit status, output and errors of a shell's line; `name` and `sent` as above."""
+    (tmp_path / "sitecustomize.py").write_text(STRIKER.format(name=name, sent=int(sent)))
+    path = {"PYTHONPATH": os.pathsep.join((str(tmp_path), os.getcwd()))}
+    words = ["sh", "-c", line.replace("python", shlex.quote(sys.executable))]
+    done = subprocess.run(words, env=os.environ | path, capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_a_script_may_ignore_ctrl_c_for_its_commands(tmp_path: Path) -> None:
+    """As shells do for what a script starts in the background."""
+    line = "trap '' INT; exec python -m experiments.evaluate --help"
+    status, said, error = in_shell(tmp_path, line, "tyro", signal.SIGINT)
+    assert (status, error) == (0, "")
+    assert "--policy" in said
+
+
+def test_a_command_without_standard_output_is_stopped_in_one_line(tmp_path: Path) -> None:
+    line = f"exec python -m experiments.evaluate --policy random --out {tmp_path / 'out'} >&-"
+    done = in_shell(tmp_path, line, "jax.numpy", signal.SIGTERM)
+    assert done == (128 + signal.SIGTERM, "", "stopped\n")
 
 
 @pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])

@@ -98,8 +98,6 @@ def assert_equal_runs(one: Path, other: Path) -> None:
 
 @pytest.mark.slow
 def test_killed_at_random_moments_a_run_ends_as_one_that_was_not(tmp_path: Path) -> None:
-    # Tests that were started in the background may ignore Ctrl-C, and children inherit that.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     out, whole = tmp_path / "killed", tmp_path / "whole"
     draw = random.Random(0)
     newest, struck, hit_writing = -1, [], 0
