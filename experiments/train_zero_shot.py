@@ -182,8 +182,10 @@ def how_to_go_on(folder: Path) -> str:
 
 def title(run: Run) -> str:
     """tdanet, split 18/4, seed 0; or tdanet, --odometry, ..."""
-    sensing = ", --odometry" if run.model.odometry else ""
-    return f"{run.config.model}{sensing}, split {run.task.split.name}, seed {run.config.seed}"
+    from tdanet_jax.report import agent_name
+
+    name = agent_name(run.config.model, run.model.odometry)
+    return f"{name}, split {run.task.split.name}, seed {run.config.seed}"
 
 
 def learn(run: Run, tensorboard: bool, stop: StopRequest) -> None:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from tdanet_jax.scenes.geometry import STEPS
 from tdanet_jax.scenes.poses import ROTATIONS
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action
 
@@ -28,8 +29,6 @@ BLOCKED = 1 << ROTATIONS
 NUMBERS = 6 + NUM_ACTIONS + WINDOW * WINDOW * (ROTATIONS + 1)
 #: Metres are divided by this many cells (4 m).
 REACH = 16.0
-#: The cell that MoveAhead leads to, by heading, as (right, ahead).
-AHEAD = np.array([(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)], np.int32)
 
 
 def _window_offsets() -> np.ndarray:
@@ -108,7 +107,7 @@ def follow(trail: Trail, action: jax.Array, blocked: jax.Array) -> Trail:
       action: int32; 6, before the first action, changes nothing.
       blocked: bool, whether the agent did not move; it counts if the action is MoveAhead.
     """
-    ahead = trail.cell + jnp.asarray(AHEAD)[trail.heading]
+    ahead = trail.cell + jnp.asarray(STEPS)[trail.heading]
     moves = action == Action.MOVE_AHEAD
     blocked = moves & blocked
     cell = jnp.where(moves & ~blocked, ahead, trail.cell)

@@ -61,6 +61,11 @@ class Provenance:
     odometry: bool = False
 
 
+def agent_name(model: str, odometry: bool) -> str:
+    """A model's name, and whether it senses more than the paper's agents do."""
+    return f"{model}, --odometry" if odometry else model
+
+
 def columns(tables: SceneTables, episodes: Episodes, records: Records) -> dict[str, np.ndarray]:
     """Records as named columns of length E, with names in place of indices."""
     pose = poses.split(episodes.pose)
@@ -177,7 +182,7 @@ def all_rows(
 
 def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarray]]) -> str:
     """`results.md`: the tables of the paper's form, with the paper's rows beside ours."""
-    agent = f"{out['model']}, --odometry" if out["odometry"] else out["model"]
+    agent = agent_name(out["model"], out["odometry"])
     lines = [
         f"# {agent}, split {out['split']}, seed {out['seed']}",
         "",
