@@ -54,6 +54,8 @@ class Command:
     """Models of the `rollout`, `update` and `decision` parts."""
     odometry: bool = False
     """Those models sense their own way, as with the flag of the training command."""
+    triangulation: bool = False
+    """And, with --odometry, where their target is."""
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
     devices: int = 1
@@ -63,6 +65,11 @@ class Command:
     """Timed repetitions of each figure."""
     out: Path | None = None
     """File for the figures, one JSON object per line, written as they come; must not exist."""
+
+    @property
+    def network(self) -> NetworkConfig:
+        """What the models sense."""
+        return NetworkConfig(odometry=self.odometry, triangulation=self.triangulation)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -79,7 +86,7 @@ def main(arguments: list[str] | None = None) -> None:
             networks=command.networks,
         )
         for name in command.models:
-            TrainConfig(model=name).check()
+            TrainConfig(model=name, network=command.network).check()
         if command.odometry and not {"rollout", "update", "decision"} & set(command.parts):
             fail("--odometry: none of the --parts has a model; choose rollout, update or decision")
         if command.checkpoint is not None:
@@ -133,7 +140,8 @@ def figures(command: Command) -> Iterator[Row]:
             yield measure.evaluation_row(command.checkpoint, task, networks, command.repeats)
     for name in command.models:
         for row in model_rows(command, name, peak):
-            yield {"part": row.pop("part"), "model": name, "odometry": command.odometry, **row}
+            senses = {"odometry": command.odometry, "triangulation": command.triangulation}
+            yield {"part": row.pop("part"), "model": name, **senses, **row}
 
 
 def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]:
@@ -150,7 +158,7 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
     acts = {"rollout", "update"} & set(command.parts)
     measured = set()
     for asked in command.precisions if acts else ():
-        network = NetworkConfig(precision=asked, odometry=command.odometry)
+        network = dataclasses.replace(command.network, precision=asked)
         task = load_task(TrainConfig(model=name, network=network, data=command.data))
         precision = jnp.dtype(task.model.dtype).name
         if precision in measured:  # some models multiply in float32, whatever is asked for
@@ -164,8 +172,7 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
                 share = measure.share_of_peak(task, row, peak) if name == "tdanet" else {}
                 yield {**row, **share, "precision": precision}
     if "decision" in command.parts:
-        network = NetworkConfig(odometry=command.odometry)
-        task = load_task(TrainConfig(model=name, network=network, data=command.data))
+        task = load_task(TrainConfig(model=name, network=command.network, data=command.data))
         for count in (1, 1024):
             yield measure.decision_row(task, count, command.repeats)
 
@@ -271,8 +278,8 @@ def as_table(rows: list[Row]) -> Table:
     """All rows as one table: the part, its setting, and its figures."""
     table = Table("part", "setting", "figures")
     settings = (
-        "environments", "devices", "observations", "precision", "model", "odometry", "batch",
-        "networks", "episodes",
+        "environments", "devices", "observations", "precision", "model", "odometry",
+        "triangulation", "batch", "networks", "episodes",
     )  # fmt: skip
     for row in rows:
         setting = ", ".join(f"{k} {row[k]}" for k in settings if k in row)

@@ -184,7 +184,7 @@ def title(run: Run) -> str:
     """tdanet, split 18/4, seed 0; or tdanet, --odometry, ..."""
     from tdanet_jax.report import agent_name
 
-    name = agent_name(run.config.model, run.model.odometry)
+    name = agent_name(run.config.model, run.model.odometry, run.model.triangulation)
     return f"{name}, split {run.task.split.name}, seed {run.config.seed}"
 
 
@@ -287,6 +287,7 @@ def report_on(run: Run, lists: Mapping[str, Episodes]) -> None:
         data=run.config.data,
         image=task.image,
         odometry=task.model.odometry,
+        triangulation=task.model.triangulation,
     )
     print_summary(report.write(run.folder, provenance, task.tables, played))
     console.print(f"wrote {run.folder / 'results.md'}")

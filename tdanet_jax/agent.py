@@ -117,7 +117,8 @@ class Agent:
             raise ValueError(f"horizon {horizon}: neither 0 nor 30 degrees")
         trail = None
         if self.model.odometry:
-            trail = odometry.begin(jnp.int32(eighths % 2), jnp.int32(horizon > 15))
+            diagonal, down = jnp.int32(eighths % 2), jnp.int32(horizon > 15)
+            trail = odometry.begin(diagonal, down, self.model.triangulation)
         return Memory(
             carry=self.model.initial_carry(1, self.weights),
             previous=jnp.zeros((1, NUM_ACTIONS)),
@@ -226,6 +227,8 @@ class Agent:
         trail = memory.trail
         if trail is not None:
             trail = odometry.follow(trail, memory.action, blocked)
+            is_target = obs.mask & (obs.classes == obs.target[:, None])
+            trail = odometry.look(trail, obs.boxes[0], is_target[0])
             obs = obs.replace(odometry=jax.tree.map(lambda x: x[None], odometry.sense(trail)))
         variables = {"params": weights}
         attention: Any = self.model.apply(variables, table, obs, method="attention")

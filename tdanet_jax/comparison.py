@@ -19,6 +19,8 @@ from tdanet_jax.vocabulary import GROUPS
 
 Result = Mapping[str, Any]
 MEASURES = ("SR", "SPL")
+#: Flags that let an agent sense what the paper's do not.
+BEYOND = ("--odometry", "--triangulation")
 #: Flags that make no other agent: the seed, which distinguishes repetitions, and what only says
 #: how often something is looked at or kept.
 NOT_SETTINGS = ("--seed", "--chunk-updates", "--checkpoint-minutes", "--history", "--max-skipped")
@@ -74,9 +76,9 @@ def _kind(result: Result) -> _Kind:
 def labels(results: Sequence[Result], names: Sequence[str]) -> list[str]:
     """A label for each result: the same for those that differ in the seed alone.
 
-    It is the model's name and the values in which the results of that model differ; that an agent
-    senses its way is always said, since the paper's do not. Results that repeat a seed are no
-    sample of seeds: each has its name behind the label.
+    It is the model's name and the values in which the results of that model differ; what an agent
+    senses that the paper's do not is always said. Results that repeat a seed are no sample of
+    seeds: each has its name behind the label.
 
     Args:
       results: with their runs' `settings`; without any where nothing was trained.
@@ -91,8 +93,7 @@ def labels(results: Sequence[Result], names: Sequence[str]) -> list[str]:
         differing = [
             _shown(flag, value)
             for flag, value in kind.values
-            if (flag, value) == ("--odometry", True)
-            or any(rival.get(flag) != value for rival in rivals)
+            if (flag in BEYOND and value) or any(rival.get(flag) != value for rival in rivals)
         ]
         out.append(", ".join([kind.model, *differing, *([name] if kind in repeated else [])]))
     return out

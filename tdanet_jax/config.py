@@ -100,6 +100,9 @@ class NetworkConfig:
     odometry: bool = False
     """Lets the agent sense its own way: the last action and whether it was blocked, where it is
     relative to its start, and a map of where it has been. Beyond the paper; any model takes it."""
+    triangulation: bool = False
+    """Lets an agent with --odometry also sense where its target is, from the directions in which
+    its boxes were seen on the way. Beyond the paper; any model takes it."""
     inner_rate: float = 1e-4
     """Size of the inner gradient steps of the models that adapt."""
     first_order: bool = False
@@ -201,6 +204,8 @@ class TrainConfig:
                 raise ValueError(f"{flag} {value}: must not be negative")
         if self.network.image == "features" and self.data is None:
             raise ValueError("--image features: needs --data, rooms that were imported with them")
+        if self.network.triangulation and not self.network.odometry:
+            raise ValueError("--triangulation: needs --odometry")
         shares = {
             "--gamma": self.learner.gamma,
             "--gae-lambda": self.learner.gae_lambda,

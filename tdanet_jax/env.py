@@ -58,6 +58,7 @@ class EnvParams(struct.PyTreeNode):
     first_feature: jax.Array | None  # [P] int32, row of a position's first pose in `features`
     max_detections: int = struct.field(pytree_node=False)  # K, most detections in any pose
     odometry: bool = struct.field(pytree_node=False, default=False)  # the agent senses its way
+    triangulation: bool = struct.field(pytree_node=False, default=False)  # and the target's place
 
 
 class EnvState(struct.PyTreeNode):
@@ -106,6 +107,7 @@ def make_params(
     features: tuple[jax.Array, np.ndarray] | None = None,
     scenes: Sequence[str] | None = None,
     odometry: bool = False,
+    triangulation: bool = False,
 ) -> EnvParams:
     """Puts scene tables into the arrays that the environment reads.
 
@@ -122,6 +124,7 @@ def make_params(
         these tables the row of its first pose there; observations then hold the map, too.
       scenes: the rooms in which `reset` begins an episode; by default all.
       odometry: observations hold what the agent senses of its own way, too.
+      triangulation: and where it senses its target.
 
     Raises:
       ValueError: no episode is possible.
@@ -149,6 +152,7 @@ def make_params(
         features=None if features is None else features[0],
         first_feature=None if features is None else jnp.asarray(features[1], jnp.int32),
         odometry=odometry,
+        triangulation=triangulation,
         **{name: jnp.asarray(v, jnp.int32) for name, v in pool.items()},
     )
 
@@ -231,15 +235,26 @@ def start(params: EnvParams, pose: jax.Array, target: jax.Array) -> EnvState:
     zero = jnp.zeros_like(pose)
     _, rotation, horizon = poses.split(pose)
     shortest = params.distance[pose, target].astype(jnp.int32) + 1
-    return EnvState(
+    state = EnvState(
         pose=pose,
         target=target,
         steps=zero,
         parents_seen=zero,
         shortest=shortest,
         similarity=None if params.similarity is None else jnp.zeros_like(pose, jnp.float32),
-        trail=odometry.begin(rotation & 1, horizon) if params.odometry else None,
     )
+    if params.odometry:
+        trail = odometry.begin(rotation & 1, horizon, params.triangulation)
+        state = state.replace(trail=_look(trail, state, params))
+    return state
+
+
+def _look(trail: Trail, state: EnvState, params: EnvParams) -> Trail:
+    """The trail, once the agent has seen what is in view."""
+    if trail.sighting is None:
+        return trail
+    classes, boxes, mask = _in_view(state.pose, params)
+    return odometry.look(trail, boxes, mask & (classes == params.target_class[state.target]))
 
 
 def reset_state(key: jax.Array, params: EnvParams) -> EnvState:
@@ -265,27 +280,34 @@ def reset(key: jax.Array, params: EnvParams) -> tuple[Observation, EnvState]:
 
 def observe(state: EnvState, params: EnvParams) -> Observation:
     """The detections in view, padded to K rows."""
-    first, last = params.row_start[state.pose], params.row_start[state.pose + 1]
-    longest = params.max_detections
-    mask = jnp.arange(longest, dtype=jnp.int32) < last - first
-    # Windows of flat arrays: looking up row by row takes twice the time.
-    classes = jax.lax.dynamic_slice(params.row_class, (first,), (longest,))
-    boxes = jax.lax.dynamic_slice(params.row_box.reshape(-1), (3 * first,), (3 * longest,))
-    in_view = jnp.arange(3 * longest, dtype=jnp.int32) < 3 * (last - first)
+    classes, boxes, mask = _in_view(state.pose, params)
     features = None
     if params.features is not None and params.first_feature is not None:
         position, *view = poses.split(state.pose)
         features = params.features[params.first_feature[position] + poses.join(0, *view)]
     return Observation(
-        classes=jnp.where(mask, classes, 0),
-        boxes=jnp.where(in_view, boxes, 0.0).reshape(longest, 3),
+        classes=classes,
+        boxes=boxes,
         mask=mask,
         target=params.target_class[state.target],
-        empty=last == first,
+        empty=~mask[0],
         cells=None if params.raster is None else params.raster[state.pose].astype(jnp.int32),
         features=features,
         odometry=None if state.trail is None else odometry.sense(state.trail),
     )
+
+
+def _in_view(pose: jax.Array, params: EnvParams) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The detections from a pose: classes [K], boxes [K, 3], zeros in padding, and mask [K]."""
+    first, last = params.row_start[pose], params.row_start[pose + 1]
+    longest = params.max_detections
+    mask = jnp.arange(longest, dtype=jnp.int32) < last - first
+    # Windows of flat arrays: looking up row by row takes twice the time.
+    classes = jax.lax.dynamic_slice(params.row_class, (first,), (longest,))
+    boxes = jax.lax.dynamic_slice(params.row_box.reshape(-1), (3 * first,), (3 * longest,))
+    inside = jnp.arange(3 * longest, dtype=jnp.int32) < 3 * (last - first)
+    boxes = jnp.where(inside, boxes, 0.0).reshape(longest, 3)
+    return jnp.where(mask, classes, 0), boxes, mask
 
 
 def is_visible(params: EnvParams, pose: jax.Array, cls: jax.Array) -> jax.Array:
@@ -316,11 +338,12 @@ def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome
     reward = jnp.where(success, DONE_REWARD + at_done, reward)
     steps = state.steps + 1
     limit = params.step_limit[params.position_room[poses.split(pose).position].astype(jnp.int32)]
-    trail = state.trail
-    if trail is not None:
-        trail = odometry.follow(trail, action, pose == state.pose)
+    after = seen.replace(pose=pose, steps=steps)
+    if state.trail is not None:
+        trail = odometry.follow(state.trail, action, pose == state.pose)
+        after = after.replace(trail=_look(trail, after, params))
     return Outcome(
-        state=seen.replace(pose=pose, steps=steps, trail=trail),
+        state=after,
         reward=reward.astype(jnp.float32),
         terminated=done,
         truncated=~done & (steps >= limit),

@@ -27,6 +27,7 @@ from tdanet_jax import (
     parameters,
     policies,
     saved,
+    triangulation,
 )
 from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import EnvParams
@@ -180,7 +181,8 @@ def tdanet_forward_macs(model: ActorCritic, words_width: int) -> int:
     action = NUM_ACTIONS * model.action_width
     way = ODOMETRY_UNITS if model.odometry else 0
     lstm = (width + way + model.action_width + hidden) * 4 * hidden
-    return encoder + action + way * odometry.NUMBERS + lstm + hidden * (NUM_ACTIONS + 1)
+    numbers = odometry.NUMBERS + (triangulation.NUMBERS if model.triangulation else 0)
+    return encoder + action + way * numbers + lstm + hidden * (NUM_ACTIONS + 1)
 
 
 def update_cost(

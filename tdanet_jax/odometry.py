@@ -14,8 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from tdanet_jax import triangulation
 from tdanet_jax.scenes.geometry import STEPS
 from tdanet_jax.scenes.poses import ROTATIONS
+from tdanet_jax.triangulation import Sighting
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action
 
 #: Cells of 0.25 m along each side of the map; beyond them it begins anew, like the surface of a
@@ -62,6 +64,7 @@ class Trail(struct.PyTreeNode):
     action: jax.Array  # int32, the last action; 6 before the first
     blocked: jax.Array  # bool, the last action was a MoveAhead that did not move the agent
     cells: jax.Array  # [MAP, MAP] uint16, the bits of each cell
+    sighting: Sighting | None = None  # where the target was seen, if the agent senses that
 
 
 class Odometry(struct.PyTreeNode):
@@ -71,14 +74,16 @@ class Odometry(struct.PyTreeNode):
     #: 4 m; sine and cosine of its heading; horizon; whether it was blocked; the last action.
     motion: jax.Array
     window: jax.Array  # [WINDOW, WINDOW] uint16, the map around it; headings relative to its own
+    target: jax.Array | None = None  # [5] float32, `triangulation.sense`; if it senses that
 
 
-def begin(diagonal: jax.Array, horizon: jax.Array) -> Trail:
+def begin(diagonal: jax.Array, horizon: jax.Array, sights: bool = False) -> Trail:
     """The trail at the start of an episode.
 
     Args:
       diagonal: int32, 1 if the agent faces along a diagonal of the grid, 0 if along an axis.
       horizon: int32, 1 while looking down.
+      sights: whether the agent senses the target's place, too.
     """
     cells = jnp.zeros((MAP, MAP), jnp.uint16).at[0, 0].set((1 << diagonal).astype(jnp.uint16))
     return Trail(
@@ -88,6 +93,7 @@ def begin(diagonal: jax.Array, horizon: jax.Array) -> Trail:
         action=jnp.full_like(diagonal, NUM_ACTIONS),
         blocked=jnp.zeros_like(diagonal, bool),
         cells=cells,
+        sighting=triangulation.begin() if sights else None,
     )
 
 
@@ -116,6 +122,9 @@ def follow(trail: Trail, action: jax.Array, blocked: jax.Array) -> Trail:
     changed = jnp.where(blocked, ahead, cell) & (MAP - 1)
     bit = jnp.where(blocked, BLOCKED, 1 << heading).astype(jnp.uint16)
     at = changed[0], changed[1]
+    sighting = trail.sighting
+    if sighting is not None:
+        sighting = triangulation.follow(sighting, cell - trail.cell)
     return Trail(
         cell=cell,
         heading=heading,
@@ -123,7 +132,22 @@ def follow(trail: Trail, action: jax.Array, blocked: jax.Array) -> Trail:
         action=action.astype(jnp.int32),
         blocked=blocked,
         cells=trail.cells.at[at].set(trail.cells[at] | bit),
+        sighting=sighting,
     )
+
+
+def look(trail: Trail, boxes: jax.Array, is_target: jax.Array) -> Trail:
+    """The trail, once the agent has seen where its target is in view.
+
+    Args:
+      trail: of an agent that senses the target's place; others have no use for this.
+      boxes: [K, 3] x, y, S of the detections.
+      is_target: [K] bool, False in padding.
+    """
+    if trail.sighting is None:
+        return trail
+    seen = triangulation.look(trail.sighting, trail.heading, trail.horizon, boxes, is_target)
+    return trail.replace(sighting=seen)
 
 
 def sense(trail: Trail) -> Odometry:
@@ -141,6 +165,7 @@ def sense(trail: Trail) -> Odometry:
     return Odometry(
         motion=jnp.concatenate([motion, jax.nn.one_hot(trail.action, NUM_ACTIONS)]),
         window=(turned | bits & BLOCKED).astype(jnp.uint16),
+        target=None if trail.sighting is None else triangulation.sense(trail.sighting, heading),
     )
 
 
@@ -148,10 +173,11 @@ def numbers(sensed: Odometry) -> jax.Array:
     """All of it as float32, [..., NUMBERS], from leading axes [...]."""
     bits = sensed.window[..., None] >> jnp.arange(ROTATIONS + 1, dtype=jnp.uint16) & 1
     flat = bits.reshape(*bits.shape[:-3], -1)
-    return jnp.concatenate([sensed.motion, flat.astype(jnp.float32)], axis=-1)
+    target = [] if sensed.target is None else [sensed.target]
+    return jnp.concatenate([sensed.motion, flat.astype(jnp.float32), *target], axis=-1)
 
 
-def sensed_at_start(batch: int) -> Odometry:
+def sensed_at_start(batch: int, sights: bool) -> Odometry:
     """What is sensed at the start of `batch` episodes, along an axis."""
     zero = jnp.zeros(batch, jnp.int32)
-    return jax.vmap(lambda diagonal, horizon: sense(begin(diagonal, horizon)))(zero, zero)
+    return jax.vmap(lambda diagonal, horizon: sense(begin(diagonal, horizon, sights)))(zero, zero)

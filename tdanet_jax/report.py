@@ -46,6 +46,7 @@ class Provenance:
       data: file of their rooms, where they are not the bundled ones.
       image: what the model sees, if it looks at an image.
       odometry: whether it senses its own way, which the paper's agents do not.
+      triangulation: whether it senses its target's place, which they do not, either.
     """
 
     split: str
@@ -59,11 +60,13 @@ class Provenance:
     data: str | None = None
     image: str | None = None
     odometry: bool = False
+    triangulation: bool = False
 
 
-def agent_name(model: str, odometry: bool) -> str:
-    """A model's name, and whether it senses more than the paper's agents do."""
-    return f"{model}, --odometry" if odometry else model
+def agent_name(model: str, odometry: bool, triangulation: bool) -> str:
+    """A model's name, and what it senses that the paper's agents do not."""
+    senses = {"--odometry": odometry, "--triangulation": triangulation}
+    return ", ".join([model, *(flag for flag, on in senses.items() if on)])
 
 
 def columns(tables: SceneTables, episodes: Episodes, records: Records) -> dict[str, np.ndarray]:
@@ -182,7 +185,7 @@ def all_rows(
 
 def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarray]]) -> str:
     """`results.md`: the tables of the paper's form, with the paper's rows beside ours."""
-    agent = agent_name(out["model"], out["odometry"])
+    agent = agent_name(out["model"], out["odometry"], out["triangulation"])
     lines = [
         f"# {agent}, split {out['split']}, seed {out['seed']}",
         "",

@@ -180,4 +180,5 @@ def _provenance(
         data=network.rooms,
         image=task.image,
         odometry=task.model.odometry,
+        triangulation=task.model.triangulation,
     )

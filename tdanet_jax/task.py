@@ -170,6 +170,7 @@ def make_task(
             greatest_similarity(seen_rooms, cosines(train_words)) if paid == "similarity" else None,
             _places(maps, trains),
             odometry=model.odometry,
+            triangulation=model.triangulation,
         ),
         eval_params=env.make_params(
             tables,
@@ -180,6 +181,7 @@ def make_task(
             features=_places(maps, trains | True),
             scenes=split.eval_scenes,
             odometry=model.odometry,
+            triangulation=model.triangulation,
         ),
         train_words=jnp.asarray(train_words),
         words=jnp.asarray(words),
@@ -267,4 +269,4 @@ def make_model(config: TrainConfig, classes: Classes) -> ActorCritic:
     model = module.make(network, classes, dtype, **options)
     if not isinstance(model, ActorCritic):
         raise ValueError(f"--model {config.model}: `make` gives no ActorCritic")
-    return model.clone(odometry=True) if network.odometry else model
+    return model.clone(odometry=network.odometry, triangulation=network.triangulation)

@@ -35,6 +35,7 @@ class ActorCritic(nn.Module):
       dtype: operands of the LSTM's products.
       odometry: whether the agent senses its own way (`Observation.odometry`), which a layer of
         `ODOMETRY_UNITS` then adds to the features. Not the paper's.
+      triangulation: whether it senses its target's place, too (`Odometry.target`).
     """
 
     encoder: Encoder
@@ -42,6 +43,7 @@ class ActorCritic(nn.Module):
     action_width: int = 10
     dtype: Any = jnp.float32
     odometry: bool = False
+    triangulation: bool = False
 
     def setup(self) -> None:
         if self.odometry:
@@ -127,7 +129,7 @@ class ActorCritic(nn.Module):
             empty=jnp.ones(batch, bool),
             cells=jnp.full((batch, *RASTER), -1, jnp.int32) if self.encoder.IMAGE else None,
             features=jnp.zeros((batch, *FEATURES), jnp.float16) if self.encoder.maps else None,
-            odometry=sensed_at_start(batch) if self.odometry else None,
+            odometry=sensed_at_start(batch, self.triangulation) if self.odometry else None,
         )
 
     def initialise(self, key: jax.Array, words: jax.Array) -> Any:
