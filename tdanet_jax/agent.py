@@ -138,7 +138,8 @@ class Agent:
 
         The memory takes it that the decision is carried out (else, replace its `action`), and that
         a MoveAhead leads to the next point of the grid: 0.25 m on one axis, on both along a
-        diagonal.
+        diagonal. A network that senses its target's place (`--triangulation`) takes it that the
+        view is 90 degrees wide and high.
 
         Args:
           memory: from `start` or the step before.

@@ -279,7 +279,10 @@ PAPER = TrainConfig(
     network=NetworkConfig(dropout=0.25, rows="object"),
 )
 #: What did best on validation, beyond the paper (docs/results.md).
-BEST = TrainConfig(learner=LearnerConfig(gamma=0.97), network=NetworkConfig(odometry=True))
+BEST = TrainConfig(
+    learner=LearnerConfig(gamma=0.97),
+    network=NetworkConfig(odometry=True, triangulation=True),
+)
 PRESETS = {"default": TrainConfig(), "best": BEST, "paper": PAPER}
 
 
