@@ -51,8 +51,8 @@ class Command:
     run: tyro.conf.OmitArgPrefixes[TrainConfig]
     preset: Literal["default", "best", "paper"] = "default"
     """Defaults of the other flags. best: what did best on validation, beyond the paper: --odometry,
-    --triangulation and --gamma 0.97. paper: the reference's constants and its budget of 6 M
-    episodes."""
+    --triangulation, --gamma 0.97 and --size-noise 0.5. paper: the reference's constants and its
+    budget of 6 M episodes."""
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""
     resume: Path | None = None

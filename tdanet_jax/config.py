@@ -73,6 +73,9 @@ class LearnerConfig:
     """What earns something before the target is found. parents: the sight of a parent of the target
     (Eq. 3). similarity: 0.1 times the cosine between the word vectors of the target and of a class
     in view, when it is the largest of the episode so far (SSNet). none: nothing."""
+    size_noise: float = 0.0
+    """In each training episode the target looks larger or smaller by another factor, between e^-x
+    and e^x, so that the agent does not rely on how large things are. Beyond the paper."""
     bootstrap_truncated: bool = True
     """Values the state in which a time-out cut an episode; False takes it for an end, as the
     reference does."""
@@ -198,6 +201,7 @@ class TrainConfig:
             "--entropy-weight": self.learner.entropy_weight,
             "--final-entropy-weight": self.learner.final_entropy_weight,
             "--value-weight": self.learner.value_weight,
+            "--size-noise": self.learner.size_noise,
         }
         for flag, value in not_negative.items():
             if value < 0:
@@ -280,7 +284,7 @@ PAPER = TrainConfig(
 )
 #: What did best on validation, beyond the paper (docs/results.md).
 BEST = TrainConfig(
-    learner=LearnerConfig(gamma=0.97),
+    learner=LearnerConfig(gamma=0.97, size_noise=0.5),
     network=NetworkConfig(odometry=True, triangulation=True),
 )
 PRESETS = {"default": TrainConfig(), "best": BEST, "paper": PAPER}

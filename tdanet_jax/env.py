@@ -59,6 +59,7 @@ class EnvParams(struct.PyTreeNode):
     max_detections: int = struct.field(pytree_node=False)  # K, most detections in any pose
     odometry: bool = struct.field(pytree_node=False, default=False)  # the agent senses its way
     triangulation: bool = struct.field(pytree_node=False, default=False)  # and the target's place
+    size_noise: float = struct.field(pytree_node=False, default=0.0)  # see `_size_factor`
 
 
 class EnvState(struct.PyTreeNode):
@@ -70,6 +71,7 @@ class EnvState(struct.PyTreeNode):
     parents_seen: jax.Array  # int32, bit set over the target's three parents
     shortest: jax.Array  # int32, L: actions on the optimal path from the start, Done included
     similarity: jax.Array | None = None  # float32, largest cosine so far, if it is paid for
+    size: jax.Array | None = None  # float32, factor of the areas of the target's boxes, if any
     trail: Trail | None = None  # the way so far, if the agent senses it
 
 
@@ -108,6 +110,7 @@ def make_params(
     scenes: Sequence[str] | None = None,
     odometry: bool = False,
     triangulation: bool = False,
+    size_noise: float = 0.0,
 ) -> EnvParams:
     """Puts scene tables into the arrays that the environment reads.
 
@@ -125,6 +128,7 @@ def make_params(
       scenes: the rooms in which `reset` begins an episode; by default all.
       odometry: observations hold what the agent senses of its own way, too.
       triangulation: and where it senses its target.
+      size_noise: each episode's target looks larger or smaller by up to this, as a logarithm.
 
     Raises:
       ValueError: no episode is possible.
@@ -153,6 +157,7 @@ def make_params(
         first_feature=None if features is None else jnp.asarray(features[1], jnp.int32),
         odometry=odometry,
         triangulation=triangulation,
+        size_noise=size_noise,
         **{name: jnp.asarray(v, jnp.int32) for name, v in pool.items()},
     )
 
@@ -230,8 +235,10 @@ def _pick_from(bits: jax.Array, span: jax.Array) -> jax.Array:
     return span[0] + _pick(bits, span[1])
 
 
-def start(params: EnvParams, pose: jax.Array, target: jax.Array) -> EnvState:
-    """The state at the start of the given episode."""
+def start(
+    params: EnvParams, pose: jax.Array, target: jax.Array, size: jax.Array | None = None
+) -> EnvState:
+    """The state at the start of the given episode, with a `size` other than the target's own."""
     zero = jnp.zeros_like(pose)
     _, rotation, horizon = poses.split(pose)
     shortest = params.distance[pose, target].astype(jnp.int32) + 1
@@ -242,6 +249,7 @@ def start(params: EnvParams, pose: jax.Array, target: jax.Array) -> EnvState:
         parents_seen=zero,
         shortest=shortest,
         similarity=None if params.similarity is None else jnp.zeros_like(pose, jnp.float32),
+        size=size,
     )
     if params.odometry:
         trail = odometry.begin(rotation & 1, horizon, params.triangulation)
@@ -253,7 +261,7 @@ def _look(trail: Trail, state: EnvState, params: EnvParams) -> Trail:
     """The trail, once the agent has seen what is in view."""
     if trail.sighting is None:
         return trail
-    classes, boxes, mask = _in_view(state.pose, params)
+    classes, boxes, mask = _in_view(state, params)
     return odometry.look(trail, boxes, mask & (classes == params.target_class[state.target]))
 
 
@@ -269,7 +277,17 @@ def reset_state(key: jax.Array, params: EnvParams) -> EnvState:
     pair = _pick_from(bits[2], params.scene_pairs[scene])
     position = params.start_position[_pick_from(bits[3], params.pair_starts[pair])]
     rotation = (bits[0] & 7).astype(jnp.int32)  # bits that the choice of the room does not use
-    return start(params, poses.join(position, rotation), params.pair_target[pair])
+    size = _size_factor(key, params.size_noise) if params.size_noise else None
+    return start(params, poses.join(position, rotation), params.pair_target[pair], size)
+
+
+def _size_factor(key: jax.Array, noise: float) -> jax.Array:
+    """A factor for the areas of a target's boxes, of which the sides' is between e^-noise, e^noise.
+
+    An agent that is to find what it never had to find should not rely on how large things are.
+    """
+    share = jax.random.uniform(jax.random.fold_in(key, 0), minval=-1.0, maxval=1.0)
+    return jnp.exp(2 * noise * share)
 
 
 def reset(key: jax.Array, params: EnvParams) -> tuple[Observation, EnvState]:
@@ -280,7 +298,7 @@ def reset(key: jax.Array, params: EnvParams) -> tuple[Observation, EnvState]:
 
 def observe(state: EnvState, params: EnvParams) -> Observation:
     """The detections in view, padded to K rows."""
-    classes, boxes, mask = _in_view(state.pose, params)
+    classes, boxes, mask = _in_view(state, params)
     features = None
     if params.features is not None and params.first_feature is not None:
         position, *view = poses.split(state.pose)
@@ -297,9 +315,9 @@ def observe(state: EnvState, params: EnvParams) -> Observation:
     )
 
 
-def _in_view(pose: jax.Array, params: EnvParams) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The detections from a pose: classes [K], boxes [K, 3], zeros in padding, and mask [K]."""
-    first, last = params.row_start[pose], params.row_start[pose + 1]
+def _in_view(state: EnvState, params: EnvParams) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The detections in view: classes [K], boxes [K, 3], zeros in padding, and mask [K]."""
+    first, last = params.row_start[state.pose], params.row_start[state.pose + 1]
     longest = params.max_detections
     mask = jnp.arange(longest, dtype=jnp.int32) < last - first
     # Windows of flat arrays: looking up row by row takes twice the time.
@@ -307,6 +325,10 @@ def _in_view(pose: jax.Array, params: EnvParams) -> tuple[jax.Array, jax.Array, 
     boxes = jax.lax.dynamic_slice(params.row_box.reshape(-1), (3 * first,), (3 * longest,))
     inside = jnp.arange(3 * longest, dtype=jnp.int32) < 3 * (last - first)
     boxes = jnp.where(inside, boxes, 0.0).reshape(longest, 3)
+    if state.size is not None:
+        is_target = classes == params.target_class[state.target]
+        area = jnp.minimum(boxes[:, 2] * jnp.where(is_target, state.size, 1.0), 1.0)
+        boxes = boxes.at[:, 2].set(area)
     return jnp.where(mask, classes, 0), boxes, mask
 
 

@@ -171,6 +171,7 @@ def make_task(
             _places(maps, trains),
             odometry=model.odometry,
             triangulation=model.triangulation,
+            size_noise=config.learner.size_noise,
         ),
         eval_params=env.make_params(
             tables,
