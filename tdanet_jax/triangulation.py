@@ -17,12 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from tdanet_jax.scenes.scene import GRID
+from tdanet_jax.scenes.scene import GRID, REACH
 
 #: Length of `sense`.
 NUMBERS = 9
-#: A target is within reach if its nearest side is this near on the level, in metres.
-REACH = 1.5
 #: Weight of the guess, where a ray weighs 1.
 GUESS = 1e-3
 #: A box is of the object that was seen before if it is less than 12 degrees away from its place.
