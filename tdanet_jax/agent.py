@@ -175,6 +175,10 @@ class Agent:
         )
         return memory._replace(action=best[0]), decision
 
+    def knows(self, label: str) -> bool:
+        """Whether a label has a word vector, so that it can be detected or looked for."""
+        return not self._vectors.missing([label])
+
     def _observe(
         self, detections: Sequence[Detection], target: str
     ) -> tuple[Observation, np.ndarray]:
