@@ -42,7 +42,7 @@ class StandIn:
         self.last_event = self._event(True)
 
     def step(self, action, **arguments):
-        self.asked.append((action, arguments))
+        self.asked.append((action, {**arguments}))
         works = True
         if action == "MoveAhead":
             works = self._move(arguments.pop("moveMagnitude", self.settings["gridSize"]))
@@ -133,14 +133,20 @@ def run(request, rooms, glove, tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def agent(run):
+    """Its agent; one for all tests, as it compiles for seconds."""
+    return tdanet_jax.load(run)
+
+
 def test_the_pixels_of_a_box_are_those_that_it_touches(rooms, some_rooms):
     grown = (rooms.row_box.astype(int) - some_rooms.row_box) * [-1, -1, 1, 1]
     assert grown.min() >= 0
     assert grown.max() <= 16
 
 
-def test_an_episode_is_the_one_of_the_environment(run, rooms):
-    agent, player = tdanet_jax.load(run), trace.load_player(run, Rooms(rooms, None))
+def test_an_episode_is_the_one_of_the_environment(run, agent, rooms):
+    player = trace.load_player(run, Rooms(rooms, None))
     chosen = episodes.draw(rooms, player.task.split.eval_scenes, TARGETS, 2, seed=1)
     actions, outcomes, stopped, ignored = [], [], 0, 0
     for i, (pose, goal) in enumerate(zip(chosen.pose, chosen.target, strict=True)):
@@ -277,8 +283,8 @@ def test_no_class_of_the_rooms_is_taken_for_a_part_of_the_building(ithor):
     assert not ai2thor.STRUCTURE & {*ithor.classes}
 
 
-def test_a_type_without_a_word_is_left_out_and_said(run, rooms):
-    agent, pose = tdanet_jax.load(run), where(rooms, 90, True)
+def test_a_type_without_a_word_is_left_out_and_said(agent, rooms):
+    pose = where(rooms, 90, True)
     odd = ("Xyzzyq", (10, 10, 20, 20))
     plain = ai2thor.play(StandIn(rooms, pose), agent, "Mug", step_limit=2)
     played = ai2thor.play(StandIn(rooms, pose, [odd]), agent, "Mug", step_limit=2)
@@ -293,9 +299,9 @@ def test_a_type_without_a_word_is_left_out_and_said(run, rooms):
         ai2thor.play(StandIn(rooms, pose), agent, "Xyzzyq")
 
 
-def test_a_frame_without_objects(run, rooms):
-    drawn = np.flatnonzero(np.diff(rooms.row_start) == 0)
-    played = ai2thor.play(StandIn(rooms, int(drawn[0])), tdanet_jax.load(run), "Mug", step_limit=1)
+def test_a_frame_without_objects(agent, rooms):
+    pose = int(np.flatnonzero(np.diff(rooms.row_start) == 0)[0])
+    played = ai2thor.play(StandIn(rooms, pose), agent, "Mug", step_limit=1)
     assert np.isfinite(played.decisions[0].probabilities).all()
 
 
@@ -324,12 +330,12 @@ def test_an_episode_ends_after_a_hundred_actions(rooms):
     ("rotation", "horizon", "message"),
     [(30, 0, "rotation 30: not a multiple of 45"), (0, 60, "horizon 60: neither 0 nor 30 degrees")],
 )
-def test_a_start_off_the_poses_is_refused(run, rooms, rotation, horizon, message):
+def test_a_start_off_the_poses_is_refused(agent, rooms, rotation, horizon, message):
     simulator = StandIn(rooms, where(rooms, 0, True))
-    agent = simulator.last_event.metadata["agent"]
-    agent["rotation"]["y"], agent["cameraHorizon"] = rotation, horizon
+    there = simulator.last_event.metadata["agent"]
+    there["rotation"]["y"], there["cameraHorizon"] = rotation, horizon
     with pytest.raises(ValueError, match=message):
-        ai2thor.play(simulator, tdanet_jax.load(run), "Mug")
+        ai2thor.play(simulator, agent, "Mug")
     assert not simulator.asked
 
 
@@ -365,9 +371,9 @@ def test_an_action_that_leads_elsewhere_is_noticed(rooms):
             self.rotation = 0.0
             return super()._event(False)
 
-    with pytest.raises(ValueError, match="MoveAhead from x .* led to x"):
+    with pytest.raises(ValueError, match=r"MoveAhead from x .* led to x"):
         ai2thor.play(Slipping(rooms, pose), Script(AHEAD), "Mug")
-    with pytest.raises(ValueError, match="RotateLeft from .* made with SETTINGS\\? blocked"):
+    with pytest.raises(ValueError, match=r"RotateLeft from .* made with SETTINGS\? blocked"):
         ai2thor.play(Stuck(rooms, pose), Script(LEFT), "Mug")
 
 
