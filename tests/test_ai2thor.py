@@ -186,7 +186,7 @@ class Script:
     """An agent that takes the given actions, and remembers what it was shown and told."""
 
     def __init__(self, *actions: Action) -> None:
-        self.actions, self.seen, self.blocked = list(actions), [], []
+        self.actions, self.seen, self.blocked, self.keys = list(actions), [], [], []
 
     def start(self, rotation, horizon):
         self.began = rotation, horizon
@@ -197,6 +197,7 @@ class Script:
     def act(self, memory, detections, target, key=None, blocked=None):
         self.seen.append(detections)
         self.blocked.append(blocked)
+        self.keys.append(key)
         return memory, Decision(self.actions[len(self.seen) - 1], np.full(6, 1 / 6), 0.0, None)
 
 
@@ -317,6 +318,15 @@ def test_success_is_what_ai2thor_calls_visible(rooms):
     assert not limited.success
     assert limited.actions == (UP, UP, UP)
     assert len(limited.places) == 4
+
+
+def test_every_step_has_a_key_of_its_own(rooms):
+    script = Script(LEFT, LEFT, LEFT, DONE)
+    ai2thor.play(StandIn(rooms, where(rooms, 0, True)), script, "Mug", jax.random.key(0))
+    assert len({tuple(jax.random.key_data(key).tolist()) for key in script.keys}) == 4
+    script = Script(DONE)
+    ai2thor.play(StandIn(rooms, where(rooms, 0, True)), script, "Mug")
+    assert script.keys == [None]
 
 
 def test_an_episode_ends_after_a_hundred_actions(rooms):
