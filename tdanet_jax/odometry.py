@@ -74,7 +74,7 @@ class Odometry(struct.PyTreeNode):
     #: 4 m; sine and cosine of its heading; horizon; whether it was blocked; the last action.
     motion: jax.Array
     window: jax.Array  # [WINDOW, WINDOW] uint16, the map around it; headings relative to its own
-    target: jax.Array | None = None  # [5] float32, `triangulation.sense`; if it senses that
+    target: jax.Array | None = None  # [9] float32, `triangulation.sense`; if it senses that
 
 
 def begin(diagonal: jax.Array, horizon: jax.Array, sights: bool = False) -> Trail:
