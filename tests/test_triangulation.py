@@ -1,0 +1,612 @@
+"""Where the target is: a slow list of sightings in degrees, known places, and the rooms' truth."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tdanet_jax import env, odometry, triangulation
+from tdanet_jax.env import EnvParams, EnvState
+from tdanet_jax.odometry import Odometry, Trail
+from tdanet_jax.reward import no_parents
+from tdanet_jax.scenes import SceneTables
+from tests.oracle import (
+    DONE,
+    LOOK_DOWN,
+    LOOK_UP,
+    MOVE_AHEAD,
+    ROOMS,
+    ROTATE_LEFT,
+    ROTATE_RIGHT,
+    pose_of,
+)
+from tests.test_odometry import NOTHING, RUNS, SlowTrail, toy_rooms
+
+#: A walk's actions are filled up to as many, and its frames up to as many boxes.
+LONGEST, K = 60, 6
+#: What the fast one may be off, in rounding errors of float32 for each sighting.
+ROUNDING = 4e-7
+
+
+class Box(NamedTuple):
+    """A detection, as shares of the image."""
+
+    x: float
+    y: float
+    area: float
+
+
+class SlowSighting:
+    """All sightings of one target in an episode, in the metres of its start, in float64."""
+
+    def __init__(self) -> None:
+        self.rays: list[tuple[np.ndarray, np.ndarray]] = []  # from where, and where to
+        self.radius = 0.0
+
+    def look(self, way: SlowTrail, boxes: list[Box]) -> None:
+        """What is in view of the target, from where the agent stands and looks."""
+        if not boxes:
+            return
+        away = [self.degrees(way, box) for box in boxes]
+        if min(away) < 12:
+            box = boxes[away.index(min(away))]
+        else:
+            box = max(boxes, key=lambda box: box.area)
+            self.rays = []
+        self.rays.append((camera(way), ray(way, box)))
+        self.radius = min(math.sqrt(box.area) * float(np.linalg.norm(self.seen_from(way))), 1.0)
+
+    def degrees(self, way: SlowTrail, box: Box) -> float:
+        """How far a box is from where the target is believed to be, as one stands and looks."""
+        if not self.rays:
+            return 180.0
+        return angle(ray(way, box), self.seen_from(way))
+
+    def unclear(self, way: SlowTrail, boxes: list[Box]) -> bool:
+        """Whether rounding might decide which box it is."""
+        if self.rays and float(np.linalg.norm(self.seen_from(way))) < 0.2:
+            return True  # it stands in the target
+        near = 1 + math.degrees(self.rounding(way))
+        away = sorted(self.degrees(way, box) for box in boxes)
+        area = sorted((box.area for box in boxes), reverse=True)
+        return (
+            any(abs(x - 12) < near for x in away)
+            or any(b - a < 2 * near for a, b in itertools.pairwise(away[:2]) if a < 12)
+            or any(a - b < 1e-5 for a, b in itertools.pairwise(area[:2]))
+        )
+
+    def equations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Three rows for each ray: a point's distance from it; and for the guess, which is weak."""
+        rows, right = [], []
+        for start, along in self.rays:
+            across = np.eye(3) - np.outer(along, along)
+            rows.append(across)
+            right.append(across @ start)
+        start, along = self.rays[0]
+        weight = math.sqrt(1e-3)
+        rows.append(weight * np.eye(3))
+        right.append(weight * (start + 1.5 * along))
+        return np.concatenate(rows), np.concatenate(right)
+
+    def seen_from(self, way: SlowTrail) -> np.ndarray:
+        """The target's place, from the camera along the axes of the start."""
+        place: np.ndarray = np.linalg.lstsq(*self.equations(), rcond=None)[0] - camera(way)
+        return place
+
+    def certainty(self, way: SlowTrail) -> float:
+        """The weight along the line of sight, that is half at 0.03."""
+        rows, _ = self.equations()
+        place = self.seen_from(way)
+        along = place / np.linalg.norm(place)
+        weight = 1 / float(along @ np.linalg.pinv(rows.T @ rows) @ along)
+        return weight / (weight + 0.03)
+
+    def rounding(self, way: SlowTrail) -> float:
+        """By how many metres float32 may miss the place: sums of many over what is left of them."""
+        if not self.rays:
+            return 0.0
+        rows, _ = self.equations()
+        least = float(np.linalg.svd(rows, compute_uv=False)[-1]) ** 2
+        far = 1 + float(np.linalg.norm(self.seen_from(way)))
+        return ROUNDING * len(self.rays) * far / least
+
+    def sense(self, way: SlowTrail) -> list[float]:
+        """The nine numbers."""
+        if not self.rays:
+            return [0.0] * 9
+        place = self.seen_from(way)
+        parts = [float(place @ axis) for axis in axes(way.heading)]
+        near = 1.5 - math.hypot(place[0], place[2])
+        within = [min(max(d / 0.25, -1.0), 1.0) for d in (near, near + self.radius)]
+        certain = self.certainty(way)
+        return [
+            *(min(max(x / 4, -2.0), 2.0) for x in parts), self.radius, certain,
+            *within, *(d * certain for d in within),
+        ]  # fmt: skip
+
+    def tolerance(self, way: SlowTrail) -> list[float]:
+        """What the nine numbers may be off; where one stands in the target, nobody knows."""
+        if not self.rays:
+            return [0.0] * 9
+        off = 1e-5 + self.rounding(way)
+        inside = float(np.linalg.norm(self.seen_from(way))) < 0.2
+        return [*[off] * 4, *[math.inf if inside else 4e-4 + 4 * off] * 5]
+
+
+def camera(way: SlowTrail) -> np.ndarray:
+    """Where the agent's camera is."""
+    return 0.25 * np.array([way.x, 0, way.z])
+
+
+def axes(heading: float, down: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Right, up and ahead of a camera, in degrees."""
+    sine, cosine = (f(math.radians(heading)) for f in (math.sin, math.cos))
+    low, level = (f(math.radians(down)) for f in (math.sin, math.cos))
+    right = np.array([cosine, 0, -sine])
+    ahead = np.array([sine * level, -low, cosine * level])
+    return right, np.cross(ahead, right), ahead
+
+
+def ray(way: SlowTrail, box: Box) -> np.ndarray:
+    """The direction of a box's centre: the image is 90 degrees wide and high."""
+    right, up, ahead = axes(way.heading, 30 * way.horizon)
+    along = ahead + (2 * box.x - 1) * right + (1 - 2 * box.y) * up
+    return np.asarray(along / np.linalg.norm(along))
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    """Between two directions, in degrees."""
+    return math.degrees(math.atan2(np.linalg.norm(np.cross(a, b)), a @ b))
+
+
+def box_of(way: SlowTrail, place: np.ndarray, size: float) -> Box | None:
+    """How a square of some size, in metres, is seen from a pose; None if its middle is not."""
+    from_camera = place - camera(way)
+    x, y, depth = (float(from_camera @ axis) for axis in axes(way.heading, 30 * way.horizon))
+    if depth < 0.1 or max(abs(x), abs(y)) > depth:
+        return None
+    return Box(0.5 + x / depth / 2, 0.5 - y / depth / 2, min((size / depth / 2) ** 2, 1.0))
+
+
+class Frames(NamedTuple):
+    """What is in view at the start of a walk and after each of its actions."""
+
+    boxes: np.ndarray  # [N + 1, K, 3]
+    is_target: np.ndarray  # [N + 1, K]
+
+
+def frames_of(seen: list[list[Box]], rng: np.random.Generator) -> Frames:
+    """The boxes of the target among others, in any order, with rows of padding."""
+    boxes = rng.random((LONGEST + 1, K, 3))
+    is_target = np.zeros((LONGEST + 1, K), bool)
+    for t, found in enumerate(seen):
+        rows = rng.permutation(K)[: len(found)]
+        boxes[t, rows], is_target[t, rows] = np.reshape(found, (-1, 3)), True
+        padding = np.arange(K) > rng.integers(K)
+        boxes[t, padding & ~is_target[t]] = 0.0
+    return Frames(boxes.astype(np.float32), is_target)
+
+
+@jax.jit
+def walked(
+    diagonal: Any, horizon: Any, actions: Any, blocked: Any, frames: Frames
+) -> tuple[Trail, jax.Array]:
+    """Trails and what is sensed of the target, [N + 1], at the start and after every action."""
+
+    def step(trail: Trail, given: tuple) -> tuple[Trail, tuple[Trail, Any]]:
+        action, blocked, frame = given
+        trail = odometry.look(odometry.follow(trail, action, blocked), *frame)
+        return trail, (trail.replace(cells=jnp.zeros(0)), odometry.sense(trail).target)
+
+    begun = odometry.begin(jnp.int32(diagonal), jnp.int32(horizon), sights=True)
+    actions = jnp.concatenate([jnp.array([NOTHING]), actions])
+    return jax.lax.scan(step, begun, (actions, jnp.append(True, blocked), frames))[1]
+
+
+def filled(walk: list[tuple[int, bool]]) -> tuple[np.ndarray, np.ndarray]:
+    """Actions and flags of a walk, filled up with turns: one shape is compiled."""
+    rows = [*walk, *[(ROTATE_LEFT, False)] * LONGEST][:LONGEST]
+    return np.array([a for a, _ in rows], np.int32), np.array([b for _, b in rows])
+
+
+class Story(NamedTuple):
+    """A walk past some targets, and what the slow one senses of them."""
+
+    walk: list[tuple[int, bool]]
+    frames: Frames
+    sensed: list[list[float]]  # at the start and after every action
+    tolerance: list[list[float]]
+    begun: int  # how often it began with another box
+
+
+def told(diagonal: bool, horizon: int, runs: list, seed: int, noise: float) -> Story:
+    """A walk past one to three targets; nothing is in view where rounding would decide."""
+    rng = np.random.default_rng(seed)
+    walk = [(action, blocked) for action, blocked, times in runs for _ in range(times)][:LONGEST]
+    targets = [
+        (rng.uniform((-4, -1.5, -4), (4, 1, 4)), rng.uniform(0.05, 1.5))
+        for _ in range(rng.integers(1, 4))
+    ]
+    way, slow = SlowTrail(diagonal, horizon), SlowSighting()
+    seen, sensed, tolerance, begun = [], [], [], 0
+    for t in range(len(walk) + 1):
+        if t:
+            way.follow(*walk[t - 1])
+        boxes = [box for place, size in targets if (box := box_of(way, place, size))]
+        if noise == 1:  # anything, anywhere
+            boxes = [Box(*rng.random(3)) for _ in range(rng.integers(4))]
+        elif noise:
+            boxes = [Box(*np.clip(box + noise * rng.normal(size=3), 1e-3, 1)) for box in boxes]
+        boxes = [Box(*map(float, np.float32(box))) for box in boxes]
+        if rng.random() < 0.2 or slow.unclear(way, boxes):
+            boxes = []
+        slow.look(way, boxes)
+        begun += bool(boxes) and len(slow.rays) == 1
+        seen.append(boxes)
+        sensed.append(slow.sense(way))
+        tolerance.append(slow.tolerance(way))
+    return Story(walk, frames_of(seen, rng), sensed, tolerance, begun)
+
+
+def assert_as_told(story: Story, diagonal: bool, horizon: int) -> None:
+    _, found = walked(diagonal, horizon, *filled(story.walk), story.frames)
+    off = np.abs(np.asarray(found)[: len(story.sensed)] - story.sensed)
+    assert (off <= story.tolerance).all(), off.max(axis=0)
+
+
+STORIES = {
+    "diagonal": st.booleans(),
+    "horizon": st.integers(0, 1),
+    "runs": RUNS,
+    "seed": st.integers(0, 2**32 - 1),
+    "noise": st.sampled_from((0.0, 0.02, 1.0)),
+}
+
+
+@settings(max_examples=60)
+@given(**STORIES)
+def test_every_step_is_that_of_the_slow_sighting(
+    diagonal: bool, horizon: int, runs: list, seed: int, noise: float
+) -> None:
+    assert_as_told(told(diagonal, horizon, runs, seed, noise), diagonal, horizon)
+
+
+# Known places
+
+
+def walked_past(
+    place: np.ndarray,
+    size: float,
+    walk: list[tuple[int, bool]],
+    diagonal: bool = False,
+    last: int = LONGEST,
+) -> tuple[list[SlowTrail], np.ndarray, int]:
+    """Where one stands at each step, what is sensed of a target, and how often it was in view.
+
+    After the step `last` the agent sees no more.
+    """
+    ways, seen, way = [], [], SlowTrail(diagonal, 0)
+    for t in range(len(walk) + 1):
+        if t:
+            way.follow(*walk[t - 1])
+        ways.append(copy.copy(way))
+        box = box_of(way, place, size) if t <= last else None
+        seen.append([] if box is None else [box])
+    frames = frames_of(seen, np.random.default_rng(0))
+    _, sensed = walked(diagonal, 0, *filled(walk), frames)
+    return ways, np.asarray(sensed)[: len(walk) + 1], sum(map(bool, seen))
+
+
+AHEAD = [(MOVE_AHEAD, False)]
+PLACES = st.tuples(
+    st.sampled_from((-1, 1)), st.floats(0.8, 1.2), st.floats(-0.7, 0.4), st.floats(3.0, 4.0)
+)
+
+
+def from_start(side: int, right: float, up: float, ahead: float, diagonal: bool) -> np.ndarray:
+    """A point to the right or left, up and ahead of the start as it faces, in metres."""
+    x, y, z = axes(45 * diagonal)
+    return np.asarray(side * right * x + up * y + ahead * z)
+
+
+@settings(max_examples=25)
+@given(place=PLACES, diagonal=st.booleans(), size=st.floats(0.05, 2.0))
+def test_what_is_passed_is_found_to_within_centimetres_whatever_its_size(
+    place: tuple, diagonal: bool, size: float
+) -> None:
+    target = from_start(*place, diagonal)
+    ways, sensed, times = walked_past(target, size, 16 * AHEAD, diagonal)
+    assert times > 4
+    last = [float((target - camera(ways[-1])) @ axis) for axis in axes(45 * diagonal)]
+    np.testing.assert_allclose(4 * sensed[-1, :3], last, atol=0.03)
+    assert sensed[times - 1, 4] > 0.7
+    _, other, _ = walked_past(target, 0.3, 16 * AHEAD, diagonal)
+    np.testing.assert_array_equal(sensed[:, [0, 1, 2, 4, 5, 7]], other[:, [0, 1, 2, 4, 5, 7]])
+
+
+#: What does not move the agent.
+STILL = (
+    (ROTATE_LEFT, False), (ROTATE_RIGHT, False), (LOOK_UP, False), (LOOK_DOWN, False),
+    (MOVE_AHEAD, True), (DONE, True),
+)  # fmt: skip
+
+
+@settings(max_examples=25)
+@given(place=PLACES, diagonal=st.booleans(), still=st.lists(st.sampled_from(STILL), max_size=12))
+def test_who_stands_still_senses_the_same_in_another_direction(
+    place: tuple, diagonal: bool, still: list
+) -> None:
+    target = from_start(*place, diagonal)
+    ways, sensed, _ = walked_past(target, 0.3, [*4 * AHEAD, *still], diagonal, last=4)
+    there = np.stack(axes(45 * diagonal)).T @ sensed[4, :3]
+    assert np.linalg.norm(there) > 0.2
+    for way, row in zip(ways[4:], sensed[4:], strict=True):
+        np.testing.assert_allclose(row[3:], sensed[4, 3:], atol=2e-5)
+        np.testing.assert_allclose(np.stack(axes(way.heading)).T @ row[:3], there, atol=1e-5)
+
+
+@settings(max_examples=25)
+@given(place=PLACES, moves=st.integers(0, 10), size=st.floats(0.05, 2.0))
+def test_one_sighting_is_a_place_within_reach_and_hardly_certain(
+    place: tuple, moves: int, size: float
+) -> None:
+    target = from_start(*place, diagonal=False)
+    ways, sensed, _ = walked_past(target, size, moves * AHEAD, last=0)
+    guess = 1.5 * target / np.linalg.norm(target)
+    box = box_of(ways[0], target, size)
+    assert box is not None
+    for way, row in zip(ways, sensed, strict=True):
+        np.testing.assert_allclose(4 * row[:3], guess - camera(way), atol=2e-3)
+        np.testing.assert_allclose(row[3], min(1.5 * math.sqrt(box.area), 1.0), rtol=1e-3)
+    assert 0.01 < sensed[0, 4] < 0.05
+
+
+def test_nothing_is_sensed_before_the_target_was_seen() -> None:
+    for walk in ([], 10 * AHEAD, [(LOOK_DOWN, False), (ROTATE_LEFT, False), *AHEAD]):
+        behind = from_start(1, 0.0, 0.0, -3.0, diagonal=False)
+        _, sensed, times = walked_past(behind, 1.0, walk)
+        assert times == 0
+        np.testing.assert_array_equal(sensed, np.zeros((len(walk) + 1, 9)))
+
+
+@pytest.mark.parametrize("size", [0.2, 0.6, 3.0])
+def test_the_radius_is_half_a_side_at_the_distance_and_how_far_the_reach_goes(size: float) -> None:
+    target = from_start(1, 0.8, 0.0, 3.0, diagonal=False)
+    ways, sensed, times = walked_past(target, size, 10 * AHEAD)
+    assert 6 < times <= 10
+    away = 4 * np.linalg.norm(sensed[:, :3], axis=1)
+    boxes = [box_of(way, target, size) for way in ways[:times]]
+    half = [math.sqrt(box.area) * far for box, far in zip(boxes, away, strict=False) if box]
+    np.testing.assert_allclose(sensed[:times, 3], np.minimum(half, 1.0), rtol=1e-4)
+    # Out of view it stays as it was last seen.
+    np.testing.assert_array_equal(sensed[times:, 3], sensed[times - 1, 3])
+    level = 4 * np.hypot(sensed[:, 0], sensed[:, 2])
+    for column, near in ((5, 0.0), (6, sensed[:, 3])):
+        within = np.clip((1.5 - level + near) / 0.25, -1, 1)
+        np.testing.assert_allclose(sensed[:, column], within, atol=1e-4)
+        certainly = sensed[:, column] * sensed[:, 4]
+        np.testing.assert_allclose(sensed[:, column + 2], certainly, atol=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [5.0, 10.0, 14.0, 20.0])
+def test_of_several_it_goes_on_with_the_one_it_saw_or_begins_with_the_largest(
+    degrees: float,
+) -> None:
+    known, large = Box(0.5, 0.5, 0.01), Box(0.1, 0.5, 0.3)
+    moved = known._replace(x=0.5 + math.tan(math.radians(degrees)) / 2)
+    frames = frames_of([[known], [moved, large]], np.random.default_rng(0))
+    _, sensed = walked(False, 0, *filled([(LOOK_UP, False)]), frames)
+    right, _, ahead, *_ = np.asarray(sensed[1])
+    found = math.degrees(math.atan2(right, ahead))
+    if degrees < 12:  # between the rays to the one that it knows
+        assert found == pytest.approx(degrees / 2, abs=0.1)
+    else:
+        assert found == pytest.approx(-math.degrees(math.atan(0.8)), abs=0.1)
+        assert 4 * math.hypot(right, ahead) == pytest.approx(1.5, abs=1e-3)
+
+
+def test_compiled_is_eager_and_many_are_one_by_one() -> None:
+    runs = [(MOVE_AHEAD, False, 3), (ROTATE_RIGHT, False, 1), (MOVE_AHEAD, True, 1)]
+    starts = [(False, 0), (True, 1), (True, 0)]
+    stories = [told(*start, runs, seed, 1.0) for seed, start in enumerate(starts)]
+    walks = [(*start, *filled(s.walk), s.frames) for start, s in zip(starts, stories, strict=True)]
+    alone = [walked(*walk) for walk in walks]
+    close = {"rtol": 1e-4, "atol": 1e-4}  # crossings of a few rays, in another order
+    together = jax.vmap(walked)(*jax.tree.map(lambda *x: jnp.stack(x), *walks))
+    chex.assert_trees_all_close(together, jax.tree.map(lambda *x: jnp.stack(x), *alone), **close)
+    assert all(np.asarray(sensed).any() for _, sensed in alone)
+    trail = odometry.begin(jnp.int32(1), jnp.int32(1), sights=True)
+    for t in range(len(stories[1].walk) + 1):
+        action, blocked = stories[1].walk[t - 1] if t else (NOTHING, True)
+        trail = odometry.follow(trail, jnp.int32(action), jnp.asarray(blocked))
+        trail = odometry.look(trail, *(jnp.asarray(x[t]) for x in stories[1].frames))
+        eager = trail.replace(cells=jnp.zeros(0)), odometry.sense(trail).target
+        compiled = jax.tree.map(lambda x, t=t: x[t], alone[1])
+        chex.assert_trees_all_close(eager, compiled, **close)
+        chex.assert_trees_all_equal_dtypes(eager, compiled)
+
+
+def test_a_trail_without_a_sighting_is_left_alone() -> None:
+    trail = jax.eval_shape(odometry.begin, jnp.int32(0), jnp.int32(0))
+    assert trail.sighting is jax.eval_shape(odometry.sense, trail).target is None
+    assert odometry.look(trail, jnp.ones((2, 3)), jnp.ones(2, bool)) is trail
+
+
+def test_the_numbers_of_the_target_stand_behind_the_others() -> None:
+    rng = np.random.default_rng(0)
+    motion, target = (jnp.asarray(rng.normal(size=(2, 3, n)), jnp.float32) for n in (12, 9))
+    window = jnp.asarray(rng.integers(0, 512, (2, 3, 9, 9)), jnp.uint16)
+    found = odometry.numbers(Odometry(motion, window, target))
+    assert found.shape == (2, 3, odometry.NUMBERS + triangulation.NUMBERS)
+    assert found.dtype == jnp.float32
+    np.testing.assert_array_equal(found[..., -9:], target)
+    np.testing.assert_array_equal(found[..., :-9], odometry.numbers(Odometry(motion, window)))
+
+
+# In the environment
+
+
+def params_of(tables: SceneTables, sights: bool, limit: int = 1000) -> EnvParams:
+    """Episodes for every target in every room, of an agent that senses its way."""
+    targets, limits = dict.fromkeys(ROOMS, tables.targets), (limit,) * 4
+    return env.make_params(
+        tables, targets, no_parents(tables), limits, merge=False, odometry=True,
+        triangulation=sights,
+    )  # fmt: skip
+
+
+@pytest.fixture(params=["real", "toy"])
+def tables(request: pytest.FixtureRequest) -> SceneTables:
+    if request.param == "toy":
+        return toy_rooms()
+    found: SceneTables = request.getfixturevalue("some_rooms")
+    return found
+
+
+class Walks(NamedTuple):
+    """Random walks, half of their actions MoveAhead, that ask for something in their rooms."""
+
+    pose: np.ndarray  # [N + 1, B]
+    goal: np.ndarray  # [B]
+    actions: np.ndarray  # [N, B]
+    sensed: np.ndarray  # [N + 1, B, 9]
+
+
+@jax.jit
+def sensed_on(params: EnvParams, pose: Any, goal: Any, actions: Any) -> Any:
+    """Poses and what is sensed of the target, at the start of episodes and on their way."""
+
+    def step(state: EnvState, action: jax.Array) -> tuple[EnvState, Any]:
+        state = jax.vmap(env.transition, (0, 0, None))(state, action, params).state
+        return state, look(state)
+
+    def look(state: EnvState) -> Any:
+        obs = jax.vmap(env.observe, (0, None))(state, params)
+        assert obs.odometry is not None
+        return state.pose, obs.odometry.target
+
+    start = jax.vmap(env.start, (None, 0, 0))(params, pose, goal)
+    _, after = jax.lax.scan(step, start, actions)
+    return jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), look(start), after)
+
+
+def random_walks(tables: SceneTables, batch: int, steps: int) -> Walks:
+    rng = np.random.default_rng(5)
+    state, goal = np.nonzero(tables.distance >= 0)
+    chosen = rng.integers(len(state), size=batch)
+    state, goal = state[chosen].astype(np.int32), goal[chosen].astype(np.int32)
+    actions = rng.choice(5, (steps, batch), p=[0.5, 0.2, 0.2, 0.05, 0.05]).astype(np.int32)
+    pose, sensed = jax.device_get(sensed_on(params_of(tables, True), state, goal, actions))
+    return Walks(pose, goal, actions, sensed)
+
+
+def in_view(tables: SceneTables, pose: int, goal: int) -> list[Box]:
+    """The boxes of a target from a pose; what has none is no detection."""
+    boxes = []
+    for row in range(tables.row_start[pose], tables.row_start[pose + 1]):
+        x1, y1, x2, y2 = map(float, tables.row_box[row] / (tables.image * tables.subpixel))
+        if tables.classes[tables.row_class[row]] == tables.targets[goal] and x1 >= 0:
+            boxes.append(Box((x1 + x2) / 2, (y1 + y2) / 2, (x2 - x1) * (y2 - y1)))
+    return boxes
+
+
+class SlowEpisode:
+    """What is sensed of the target on an episode's way, until rounding decides about a box."""
+
+    def __init__(self, tables: SceneTables, pose: int, goal: int) -> None:
+        start = pose_of(pose)
+        self.tables, self.goal, self.clear = tables, goal, True
+        self.way = SlowTrail(start.heading % 90 != 0, start.horizon // 30)
+        self.sighting = SlowSighting()
+        self.look(pose)
+
+    def look(self, pose: int) -> None:
+        """What is in view from the pose."""
+        boxes = in_view(self.tables, pose, self.goal)
+        self.clear = self.clear and not self.sighting.unclear(self.way, boxes)
+        if self.clear:
+            self.sighting.look(self.way, boxes)
+
+    def follow(self, action: int, before: int, after: int) -> None:
+        """An action, from pose to pose."""
+        self.way.follow(action, before == after)
+        self.look(after)
+
+    def assert_sensed(self, found: np.ndarray) -> None:
+        off = np.abs(found - self.sighting.sense(self.way))
+        assert (off <= self.sighting.tolerance(self.way)).all(), off
+
+
+def test_what_the_environment_senses_is_the_slow_sighting(tables: SceneTables) -> None:
+    walks = random_walks(tables, batch=64, steps=40)
+    compared = certain = 0
+    for b in range(64):
+        slow = SlowEpisode(tables, int(walks.pose[0, b]), int(walks.goal[b]))
+        for t in range(41):
+            if t:
+                slow.follow(int(walks.actions[t - 1, b]), *map(int, walks.pose[t - 1 : t + 1, b]))
+            if not slow.clear:
+                break
+            slow.assert_sensed(walks.sensed[t, b])
+            compared += bool(slow.sighting.rays)
+            certain += walks.sensed[t, b, 4] > 0.5
+    assert compared > 1000
+    assert certain > 90
+
+
+def test_an_automatic_reset_begins_anew() -> None:
+    tables, batch, rng = toy_rooms(), 32, np.random.default_rng(4)
+    params = params_of(tables, sights=True, limit=7)
+    reset, step = (jax.jit(jax.vmap(f, axes)) for f, axes in (
+        (env.reset, (0, None)), (env.step, (0, 0, 0, None)),
+    ))  # fmt: skip
+    obs, state = reset(jax.random.split(jax.random.key(0), batch), params)
+
+    def begun(b: int) -> SlowEpisode:
+        return SlowEpisode(tables, int(state.pose[b]), int(state.target[b]))
+
+    slow = [begun(b) for b in range(batch)]
+    forgotten = compared = 0
+    for t in range(25):
+        actions = rng.choice(6, batch, p=[0.5, 0.1, 0.2, 0.05, 0.05, 0.1])
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(1), t), batch)
+        before = state
+        obs, state, _, terminated, truncated, info = step(keys, state, actions, params)
+        final = jax.device_get(info["final_state"])
+        for b in range(batch):
+            slow[b].follow(int(actions[b]), int(before.pose[b]), int(final.pose[b]))
+            if terminated[b] or truncated[b]:
+                known, slow[b] = slow[b].sighting.rays, begun(b)
+                forgotten += bool(known) and not slow[b].sighting.rays
+            if slow[b].clear:
+                slow[b].assert_sensed(obs.odometry.target[b])
+                compared += bool(slow[b].sighting.rays)
+    assert forgotten > 10
+    assert compared > 200
+
+
+def test_without_triangulation_all_is_as_it_was(some_rooms: SceneTables) -> None:
+    state, goal = (x[::9999] for x in np.nonzero(some_rooms.distance == 3))
+    found = []
+    for sights in (False, True):
+        params = params_of(some_rooms, sights)
+        begun = jax.jit(jax.vmap(env.start, (None, 0, 0)))(params, state, goal)
+        after = jax.jit(jax.vmap(env.transition, (0, None, None)))(begun, jnp.int32(0), params)
+        found.append((after, jax.jit(jax.vmap(env.observe, (0, None)))(after.state, params)))
+    (plain, obs), (sighting, more) = found
+    assert plain.state.trail.sighting is obs.odometry.target is None
+    assert sighting.state.trail.sighting is not None
+    trail = sighting.state.trail.replace(sighting=None)
+    sighting = sighting._replace(state=sighting.state.replace(trail=trail))
+    chex.assert_trees_all_equal(sighting, plain)
+    chex.assert_trees_all_equal(more.replace(odometry=more.odometry.replace(target=None)), obs)
