@@ -12,7 +12,7 @@ import pytest
 
 import tdanet_jax
 from tdanet_jax import config as configs
-from tdanet_jax import env, history
+from tdanet_jax import env, history, triangulation
 from tdanet_jax.agent import Agent, Detection
 from tdanet_jax.classes import Classes, make_classes
 from tdanet_jax.config import NetworkConfig, TrainConfig
@@ -40,9 +40,29 @@ def agent(weights, glove):
 @pytest.fixture(scope="module")
 def sensing_agent(glove):
     """An agent that senses its way, and goes by it; it mostly moves ahead."""
-    config = dataclasses.replace(CONFIG, network=dataclasses.replace(CONFIG.network, odometry=True))
+    return going_by_odometry(glove, NetworkConfig(odometry=True))
+
+
+@pytest.fixture(scope="module")
+def sighting_agent(glove):
+    """One that senses where its target is, too."""
+    return going_by_odometry(glove, NetworkConfig(odometry=True, triangulation=True))
+
+
+@pytest.fixture(scope="module")
+def merging_agent(glove):
+    """The same, of a model that is shown one box for all objects of a class."""
+    network = NetworkConfig(odometry=True, triangulation=True, rows="class")
+    return going_by_odometry(glove, network)
+
+
+def going_by_odometry(glove, network):
+    network = dataclasses.replace(network, width=16, hidden=16, precision="float32")
+    config = dataclasses.replace(CONFIG, network=network)
     words = glove.table(["Mug", "Bed"])
     weights = samples.going_by_odometry(make_model(config, Classes()), words)
+    if network.triangulation:  # nine of its inputs, and mostly zero
+        weights["way"]["kernel"] = weights["way"]["kernel"].at[-9:].multiply(5.0)
     return Agent(config, weights, glove)
 
 
@@ -58,7 +78,7 @@ def decide_alike(agent, some_rooms, glove, merge, rotation=0, steps=3):
     parents = find_parents(some_rooms, TARGETS)
     params = env.make_params(
         some_rooms, TARGETS, parents, env.TEST_STEP_LIMITS, merge=merge,
-        odometry=agent.model.odometry,
+        odometry=agent.model.odometry, triangulation=agent.model.triangulation,
     )  # fmt: skip
     model, weights = agent.model, agent.weights
     table = actor_critic.prepare(model, weights, jnp.asarray(glove.table(some_rooms.classes)))
@@ -91,14 +111,38 @@ def decide_alike(agent, some_rooms, glove, merge, rotation=0, steps=3):
 
 
 @pytest.mark.parametrize("rotation", [0, 225])
-@pytest.mark.parametrize("senses", [False, True], ids=["plain", "odometry"])
+@pytest.mark.parametrize("who", ["agent", "sensing_agent", "sighting_agent", "merging_agent"])
 def test_it_decides_as_the_network_does_in_the_environment(
-    agent, sensing_agent, some_rooms, glove, senses, rotation
+    some_rooms, glove, who, rotation, request
 ):
-    chosen = sensing_agent if senses else agent
-    steps = 25 if senses else 3
-    stopped = decide_alike(chosen, some_rooms, glove, False, rotation, steps)
-    assert 0 < stopped < steps - 10 or not senses
+    chosen = request.getfixturevalue(who)
+    steps = 25 if chosen.model.odometry else 3
+    merge = who == "merging_agent"
+    stopped = decide_alike(chosen, some_rooms, glove, merge, rotation, steps)
+    assert 0 < stopped < steps - 10 or who == "agent"
+
+
+def test_what_an_agent_senses_of_its_target_matters(sensing_agent, sighting_agent):
+    """It remembers where the target was, and not where others were."""
+    mug, sink = Detection("mug", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.1, 0.1, 0.3, 0.4)
+
+    def trail(agent, seen, target="mug"):
+        memory, _ = agent.act(agent.start(), [sink, seen], target)
+        return memory.trail
+
+    assert trail(sensing_agent, mug).sighting is None
+    known = trail(sighting_agent, mug).sighting
+    assert float(known.normal[0, 0]) > 0
+    assert not trail(sighting_agent, sink).sighting.normal.any()
+    memory, _ = sighting_agent.act(sighting_agent.start(), [mug, sink], "mug")
+    memory = memory._replace(action=jnp.int32(Action.MOVE_AHEAD))
+    unseen = memory._replace(trail=memory.trail.replace(sighting=triangulation.begin()))
+    moved, blocked, forgot = (
+        sighting_agent.act(start, [sink], "mug", blocked=stopped)[1].probabilities
+        for start, stopped in ((memory, False), (memory, True), (unseen, False))
+    )
+    assert np.abs(moved - forgot).max() > 1e-3
+    assert np.abs(moved - blocked).max() > 1e-3
 
 
 def test_what_an_agent_senses_of_its_way_matters(sensing_agent):

@@ -114,10 +114,17 @@ def test_other_rooms_or_actions_are_apart():
     assert comparison.labels(results, "ab") == ["tdanet", "tdanet"]
 
 
-def test_that_an_agent_senses_its_way_is_always_said():
-    sensing = [of(seed, network=NetworkConfig(odometry=True)) for seed in (0, 1)]
+def test_that_an_agent_senses_its_way_or_its_target_is_always_said():
+    way, both = NetworkConfig(odometry=True), NetworkConfig(odometry=True, triangulation=True)
+    sensing, sighting = ([of(seed, network=senses) for seed in (0, 1)] for senses in (way, both))
     assert comparison.labels(sensing, "ab") == ["tdanet, --odometry"] * 2
+    assert comparison.labels(sighting, "ab") == ["tdanet, --odometry, --triangulation"] * 2
     assert comparison.labels([of(0), of(1)], "ab") == ["tdanet"] * 2
+    assert comparison.labels([of(0), sensing[0], sighting[0]], "abc") == [
+        "tdanet, no --odometry, no --triangulation",
+        "tdanet, --odometry, no --triangulation",
+        "tdanet, --odometry, --triangulation",
+    ]
 
 
 def test_twice_the_same_seed_is_no_sample_of_seeds():

@@ -37,6 +37,8 @@ def test_paper_preset_has_the_reference_constants():
         (TrainConfig(network=NetworkConfig(dropout=1.0)), "--dropout 1.0"),
         (TrainConfig(learner=LearnerConfig(learning_rate=float("nan"))), "--learning-rate nan"),
         (TrainConfig(network=NetworkConfig(odometry=1)), "--odometry 1"),
+        (TrainConfig(network=NetworkConfig(odometry=True, triangulation=1)), "--triangulation 1"),
+        (TrainConfig(network=NetworkConfig(triangulation=True)), "--triangulation: needs --odom"),
     ],
 )
 def test_a_value_out_of_range_is_named_in_one_line(config, flag):
@@ -58,13 +60,16 @@ def test_an_unreadable_config_file_is_named(tmp_path, text):
         configs.load(path)
 
 
-def test_a_run_from_before_odometry_has_none(tmp_path):
+@pytest.mark.parametrize("later", [["triangulation"], ["odometry", "triangulation"]])
+def test_a_run_from_before_odometry_or_triangulation_has_none(tmp_path, later):
     path = tmp_path / "config.json"
-    values = configs.to_json(TrainConfig())
-    del values["network"]["odometry"]
+    config = TrainConfig(network=NetworkConfig(odometry="odometry" not in later))
+    values = configs.to_json(config)
+    for name in later:
+        del values["network"][name]
     path.write_text(json.dumps(values))
-    assert configs.load(path) == TrainConfig()
-    assert not configs.load(path).network.odometry
+    assert configs.load(path) == config
+    assert not any(getattr(configs.load(path).network, name) for name in later)
 
 
 def test_an_unknown_field_is_refused(tmp_path):

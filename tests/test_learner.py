@@ -73,11 +73,10 @@ def house_params() -> EnvParams:
 
 
 PARAMS = house_params()
-#: The same network and task for an agent that senses its way, and for one that does not.
-SENSING = {
-    False: (MODEL, PARAMS),
-    True: (MODEL.clone(odometry=True), PARAMS.replace(odometry=True)),
-}
+#: The same network and task for an agent that senses its way and where its target is, and for one
+#: that does not.
+SENSES = {"odometry": True, "triangulation": True}
+SENSING = {False: (MODEL, PARAMS), True: (MODEL.clone(**SENSES), PARAMS.replace(**SENSES))}
 begin = jax.jit(learner.init, static_argnums=(1, 2))
 rollout = jax.jit(learner.rollout, static_argnums=(2, 3))
 update = jax.jit(learner.update, static_argnums=(2, 3))
@@ -228,7 +227,7 @@ def gradient(
     return jax.value_and_grad(total, has_aux=True)(state.params)
 
 
-@pytest.mark.parametrize("senses", [False, True], ids=["plain", "odometry"])
+@pytest.mark.parametrize("senses", [False, True], ids=["plain", "triangulation"])
 def test_the_tape_changes_neither_the_loss_nor_its_gradient(senses: bool) -> None:
     before, _, steps, _, advantage = example(senses)
     model, _ = SENSING[senses]
@@ -245,10 +244,18 @@ def test_what_is_sensed_of_the_way_begins_with_every_episode_and_goes_on_in_it()
     _, after, steps, *_ = example(senses=True)
     whole = jax.tree.map(
         lambda *x: jnp.concatenate([x[0], x[1][None]]),
-        (steps.obs.odometry, steps.fresh),
-        (jax.vmap(env.observe, (0, None))(after.env_state, SENSING[True][1]).odometry, after.fresh),
+        (steps.obs, steps.fresh),
+        (jax.vmap(env.observe, (0, None))(after.env_state, SENSING[True][1]), after.fresh),
     )
-    sensed, fresh = jax.device_get(whole)  # [T + 1, B]
+    obs, fresh = jax.device_get(whole)  # [T + 1, B]
+    sensed = obs.odometry
+    seen = (obs.mask & (obs.classes == obs.target[..., None])).any(axis=-1)
+    known = sensed.target.any(axis=-1)
+    # At first what is in view is all that is known; later, all that was.
+    np.testing.assert_array_equal(known[fresh], seen[fresh])
+    np.testing.assert_array_equal(known[1:], seen[1:] | (known[:-1] & ~fresh[1:]))
+    assert (known & ~seen).any()
+    assert (known[:-1] & ~known[1:]).any()
     here = np.zeros((9, 9), bool)
     here[4, 4] = True
     for t, b in np.ndindex(T + 1, B):

@@ -230,7 +230,7 @@ def test_a_start_along_a_diagonal_senses_the_same_as_one_along_an_axis() -> None
         np.testing.assert_array_equal(start.window, expected)
         motion = [0, 0, turned, math.sqrt(1 - turned**2), *[0] * 8]
         np.testing.assert_allclose(start.motion, motion, atol=1e-6)
-    batch = jax.jit(odometry.sensed_at_start, static_argnums=0)(3)
+    batch = jax.jit(odometry.sensed_at_start, static_argnums=(0, 1))(3, False)
     for row in range(3):
         chex.assert_trees_all_close(jax.tree.map(lambda x, r=row: x[r], batch), seen[0])
 

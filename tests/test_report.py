@@ -1,5 +1,6 @@
 """The shape of results.json, the records beside it, and the page."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -14,7 +15,7 @@ BUCKET = {"SR", "SPL", "SR_ci", "SPL_ci", "n"}
 TOP = [
     "version", "split", "model", "policy", "episodes_trained", "seen", "unseen", "by_room",
     "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "odometry",
-    "commit",
+    "triangulation", "commit",
 ]  # fmt: skip
 
 
@@ -69,10 +70,18 @@ def test_the_report_says_that_an_agent_senses_more_than_the_papers(played, ithor
     shown = report.Provenance(
         "18/4", "tdanet", "sample", 1, 0, 7, 2, ithor.data_version, odometry=True
     )
-    assert report.write(tmp_path, shown, ithor, played)["odometry"] is True
-    page = (tmp_path / "results.md").read_text()
-    assert page.startswith("# tdanet, --odometry, split 18/4")
-    assert "| **tdanet, --odometry (ours)** |" in page
+    for sights, name in (
+        (False, "tdanet, --odometry"),
+        (True, "tdanet, --odometry, --triangulation"),
+    ):
+        shown = dataclasses.replace(shown, triangulation=sights)
+        out = report.write(tmp_path, shown, ithor, played)
+        assert (out["odometry"], out["triangulation"]) == (True, sights)
+        page = (tmp_path / "results.md").read_text()
+        assert page.startswith(f"# {name}, split 18/4")
+        assert f"| **{name} (ours)** |" in page
+        assert report.agent_name("tdanet", True, sights) == name
+    assert report.agent_name("tdanet", False, False) == "tdanet"
 
 
 def test_percentages_run_from_0_to_100_and_an_empty_bucket_is_null(written):

@@ -89,17 +89,20 @@ def test_models_without_an_image_are_shown_none(ithor: SceneTables, glove: WordV
     assert task.train_params.features is None
 
 
-@pytest.mark.parametrize("senses", [False, True])
-def test_odometry_reaches_the_network_and_both_environments(
-    ithor: SceneTables, glove: WordVectors, senses: bool
+@pytest.mark.parametrize(("senses", "sights"), [(False, False), (True, False), (True, True)])
+def test_odometry_and_triangulation_reach_the_network_and_both_environments(
+    ithor: SceneTables, glove: WordVectors, senses: bool, sights: bool
 ) -> None:
-    network = dataclasses.replace(SMALL, odometry=senses)
+    network = dataclasses.replace(SMALL, odometry=senses, triangulation=sights)
     task = make_task(TrainConfig(network=network), rooms(ithor), glove)
-    assert task.model.odometry == senses
+    assert (task.model.odometry, task.model.triangulation) == (senses, sights)
     for params in (task.train_params, task.eval_params):
-        assert params.odometry == senses
+        assert (params.odometry, params.triangulation) == (senses, sights)
         obs, state = jax.eval_shape(env.reset, jax.random.key(0), params)
         assert (obs.odometry is not None) == (state.trail is not None) == senses
+        if senses:
+            assert (obs.odometry.target is not None) == sights
+            assert (state.trail.sighting is not None) == sights
 
 
 def test_auto_takes_the_feature_maps_that_lie_beside_the_data(tmp_path) -> None:
@@ -136,6 +139,7 @@ def test_feature_maps_need_imported_rooms() -> None:
         ("my_lab.most_alike", NetworkConfig(image="raster"), []),
         ("tdanet", NetworkConfig(odometry=True), []),
         ("savn", NetworkConfig(odometry=True), []),
+        ("tdanet", NetworkConfig(odometry=True, triangulation=True), []),
     ],
 )
 def test_flags_that_change_nothing_are_named(model, network, idle) -> None:

@@ -40,8 +40,9 @@ def one(chosen, i):
 
 @pytest.fixture(scope="module")
 def sensing_player(some_rooms, glove, tmp_path_factory):
-    """A player that senses its way."""
-    config = dataclasses.replace(TINY, network=dataclasses.replace(TINY.network, odometry=True))
+    """A player that senses its way and where its target is."""
+    network = dataclasses.replace(TINY.network, odometry=True, triangulation=True)
+    config = dataclasses.replace(TINY, network=network)
     folder = tmp_path_factory.mktemp("runs") / "sensing"
     save_untrained(config, folder, some_rooms, glove)
     return trace.load_player(folder, Rooms(some_rooms, None))
@@ -53,7 +54,7 @@ def test_sampled_episodes_come_from_the_probabilities_and_the_stream_of_the_eval
 ):
     """The batch's actions, drawn again from the traces' probabilities with the same keys."""
     player, key = request.getfixturevalue(who), jax.random.key(3)
-    assert player.model.odometry == (who == "sensing_player")
+    assert player.model.odometry == player.model.triangulation == (who == "sensing_player")
     records = evaluation.evaluate(
         player.policy, player.weights, player.task.eval_params, chosen, key
     )

@@ -421,19 +421,20 @@ def test_compiled_is_eager_and_many_are_one_by_one() -> None:
     stories = [told(*start, runs, seed, 1.0) for seed, start in enumerate(starts)]
     walks = [(*start, *filled(s.walk), s.frames) for start, s in zip(starts, stories, strict=True)]
     alone = [walked(*walk) for walk in walks]
-    close = {"rtol": 1e-4, "atol": 1e-4}  # crossings of a few rays, in another order
+    close = {"rtol": 2e-3, "atol": 2e-3}  # of one ray, three decimals of the place are left
     together = jax.vmap(walked)(*jax.tree.map(lambda *x: jnp.stack(x), *walks))
     chex.assert_trees_all_close(together, jax.tree.map(lambda *x: jnp.stack(x), *alone), **close)
     assert all(np.asarray(sensed).any() for _, sensed in alone)
-    trail = odometry.begin(jnp.int32(1), jnp.int32(1), sights=True)
-    for t in range(len(stories[1].walk) + 1):
-        action, blocked = stories[1].walk[t - 1] if t else (NOTHING, True)
-        trail = odometry.follow(trail, jnp.int32(action), jnp.asarray(blocked))
-        trail = odometry.look(trail, *(jnp.asarray(x[t]) for x in stories[1].frames))
-        eager = trail.replace(cells=jnp.zeros(0)), odometry.sense(trail).target
-        compiled = jax.tree.map(lambda x, t=t: x[t], alone[1])
-        chex.assert_trees_all_close(eager, compiled, **close)
-        chex.assert_trees_all_equal_dtypes(eager, compiled)
+    sighting, compiled = triangulation.begin(), jax.tree.map(lambda x: x[:3], alone[0])
+    for t, frame in enumerate(zip(*(x[:3] for x in stories[0].frames), strict=True)):
+        heading, horizon = compiled[0].heading[t], compiled[0].horizon[t]
+        sighting = triangulation.follow(sighting, jnp.array([0, int(t > 0)]))
+        sighting = triangulation.look(sighting, heading, horizon, *map(jnp.asarray, frame))
+        eager = sighting, triangulation.sense(sighting, heading)
+        now = compiled[0].sighting, compiled[1]
+        now = jax.tree.map(lambda x, t=t: x[t], now)
+        chex.assert_trees_all_close(eager, now, **close)
+        chex.assert_trees_all_equal_dtypes(eager, now)
 
 
 def test_a_trail_without_a_sighting_is_left_alone() -> None:
@@ -500,7 +501,7 @@ def sensed_on(params: EnvParams, pose: Any, goal: Any, actions: Any) -> Any:
     return jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), look(start), after)
 
 
-def random_walks(tables: SceneTables, batch: int, steps: int) -> Walks:
+def random_walks(tables: SceneTables, batch: int = 256, steps: int = 40) -> Walks:
     rng = np.random.default_rng(5)
     state, goal = np.nonzero(tables.distance >= 0)
     chosen = rng.integers(len(state), size=batch)
@@ -543,12 +544,12 @@ class SlowEpisode:
         self.look(after)
 
     def assert_sensed(self, found: np.ndarray) -> None:
-        off = np.abs(found - self.sighting.sense(self.way))
+        off = np.abs(np.asarray(found) - self.sighting.sense(self.way))
         assert (off <= self.sighting.tolerance(self.way)).all(), off
 
 
 def test_what_the_environment_senses_is_the_slow_sighting(tables: SceneTables) -> None:
-    walks = random_walks(tables, batch=64, steps=40)
+    walks = random_walks(tables)
     compared = certain = 0
     for b in range(64):
         slow = SlowEpisode(tables, int(walks.pose[0, b]), int(walks.goal[b]))
@@ -562,6 +563,20 @@ def test_what_the_environment_senses_is_the_slow_sighting(tables: SceneTables) -
             certain += walks.sensed[t, b, 4] > 0.5
     assert compared > 1000
     assert certain > 90
+
+
+def test_who_is_certain_is_rarely_wrong_about_the_reach(some_rooms: SceneTables) -> None:
+    walks, params = random_walks(some_rooms), params_of(some_rooms, sights=True)
+    certain = walks.sensed[..., 4] > 0.5
+    pose, goal = walks.pose[certain], np.broadcast_to(walks.goal, certain.shape)[certain]
+    in_sight = [len(in_view(some_rooms, *here)) == 1 for here in zip(pose, goal, strict=True)]
+    classes = params.target_class[goal]
+    visible = np.asarray(jax.vmap(env.is_visible, (None, 0, 0))(params, pose, classes))
+    middle, side = walks.sensed[certain][:, 5:7].T
+    too_far, near = (side <= -1) & in_sight, (middle >= 1) & in_sight
+    assert min(too_far.sum(), near.sum()) > 100
+    assert visible[too_far].mean() < 0.03
+    assert visible[near].mean() > 0.8
 
 
 def test_an_automatic_reset_begins_anew() -> None:

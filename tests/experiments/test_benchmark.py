@@ -66,18 +66,23 @@ def test_decisions_of_any_model_are_timed(ithor, tmp_path):
         "--repeats",
         "1",
         "--odometry",
+        "--triangulation",
         "--out",
     ]
     benchmark.main([*arguments, str(out)])
     rows = [json.loads(line) for line in out.read_text().splitlines()][1:]
     assert [(row["model"], row["batch"]) for row in rows] == [("ssnet", 1), ("ssnet", 1024)]
+    assert all(row["odometry"] and row["triangulation"] for row in rows)
     assert all(row["milliseconds"] > 0 and row["parameters"] > 2e6 for row in rows)
 
 
-@pytest.mark.parametrize("odometry", [False, True])
-def test_the_hand_formula_counts_the_kernels_that_a_step_uses(odometry):
+@pytest.mark.parametrize("senses", [(False, False), (True, False), (True, True)])
+def test_the_hand_formula_counts_the_kernels_that_a_step_uses(senses):
     """All kernels but W_L's, which is used once per update for the table of classes."""
-    network = NetworkConfig(width=32, hidden=48, precision="float32", odometry=odometry)
+    odometry, triangulation = senses
+    network = NetworkConfig(
+        width=32, hidden=48, precision="float32", odometry=odometry, triangulation=triangulation
+    )
     model = make_model(TrainConfig(network=network), Classes())
     weights = jax.eval_shape(model.initialise, jax.random.key(0), jnp.ones((5, 50)))
     del weights["encoder"]["attention"]

@@ -65,13 +65,17 @@ def test_it_trains_evaluates_and_goes_on_after_kill_and_term(ithor, tmp_path, ca
     assert results["seen"]["L>=1"]["n"] == results["unseen"]["L>=1"]["n"] == 1000
 
 
+#: All that an agent may sense beyond the paper.
+SENSES = ("--odometry", "--triangulation")
+
+
 def test_two_processes_train_together_and_one_goes_on_alone(ithor, tmp_path):
     """The environments of one run in two processes; what they saved, one process goes on with.
 
-    With odometry: every environment has a map of its own.
+    With odometry and triangulation: every environment has a map of its own.
     """
     out = tmp_path / "run"
-    arguments = ["--steps", "2400", "--devices", "2", "--odometry", *command.TINY, "--out", out]
+    arguments = ["--steps", "2400", "--devices", "2", *SENSES, *command.TINY, "--out", out]
     port = free_port()
     both = [
         command.start(
@@ -97,7 +101,10 @@ def test_two_processes_train_together_and_one_goes_on_alone(ithor, tmp_path):
     config = json.loads((out / "config.json").read_text())
     assert config["steps"] == 3200
     assert config["network"]["odometry"]
-    assert tdanet_jax.load(out).start(45).trail is not None
+    assert config["network"]["triangulation"]
+    assert tdanet_jax.load(out).start(45).trail.sighting is not None
+    page = (out / "results.md").read_text()
+    assert page.startswith("# tdanet, --odometry, --triangulation, split")
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 8
 
 

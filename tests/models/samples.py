@@ -51,13 +51,14 @@ def one_per_class(obs: Observation, seed: int = 3) -> Observation:
     )
 
 
-def odometry(*shape: int, seed: int = 4) -> Odometry:
-    """What agents might sense of their way, in [*shape]."""
+def odometry(*shape: int, seed: int = 4, sights: bool = False) -> Odometry:
+    """What agents might sense of their way, and of their target's place, in [*shape]."""
     rng = np.random.default_rng(seed)
     bits = rng.random((*shape, 9, 9, 9)) < 0.1
     return Odometry(
         motion=jnp.asarray(rng.normal(size=(*shape, 12)), jnp.float32),
         window=jnp.asarray((bits << np.arange(9)).sum(-1), jnp.uint16),
+        target=jnp.asarray(rng.normal(size=(*shape, 9)), jnp.float32) if sights else None,
     )
 
 

@@ -117,9 +117,10 @@ def test_no_array_of_a_model_is_empty(name: str) -> None:
         assert leaf.size, jax.tree_util.keystr(path)
 
 
-def sensing(config: TrainConfig) -> TrainConfig:
-    """The same for an agent that senses its way."""
-    return dataclasses.replace(config, network=dataclasses.replace(config.network, odometry=True))
+def sensing(config: TrainConfig, sights: bool = True) -> TrainConfig:
+    """The same for an agent that senses its way, and where its target is."""
+    network = dataclasses.replace(config.network, odometry=True, triangulation=sights)
+    return dataclasses.replace(config, network=network)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -139,10 +140,14 @@ def test_every_named_model_is_made_and_answers(name: str) -> None:
     assert np.isfinite(out.logits).all()
 
 
-def test_the_odometry_stands_behind_the_encoders_features_and_leaves_them_alone() -> None:
-    plain, model = ActorCritic(Plain(), hidden=6), ActorCritic(Plain(), hidden=6, odometry=True)
+@pytest.mark.parametrize("sights", [False, True], ids=["odometry", "triangulation"])
+def test_the_odometry_stands_behind_the_encoders_features_and_leaves_them_alone(
+    sights: bool,
+) -> None:
+    plain = ActorCritic(Plain(), hidden=6)
+    model = plain.clone(odometry=True, triangulation=sights)
     weights = samples.parameters(model, WORDS)
-    obs = samples.observations(2, B).replace(odometry=samples.odometry(2, B))
+    obs = samples.observations(2, B).replace(odometry=samples.odometry(2, B, sights=sights))
     arguments = WORDS, obs, jnp.zeros((2, B, 6)), None
     alone, _ = plain.apply({"params": {}}, *arguments, method="perceive")
     features, aside = model.apply({"params": weights}, *arguments, method="perceive")
@@ -155,12 +160,14 @@ def test_the_odometry_stands_behind_the_encoders_features_and_leaves_them_alone(
     np.testing.assert_allclose(features[..., alone.shape[-1] :], expected, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("sights", [False, True], ids=["odometry", "triangulation"])
 @pytest.mark.parametrize("name", MODELS)
-def test_every_named_model_takes_odometry(name: str) -> None:
+def test_every_named_model_takes_odometry(name: str, sights: bool) -> None:
     names = tuple(f"Class{i}" for i in range(samples.CLASSES))
-    config = sensing(dataclasses.replace(SMALL, model=name))
+    config = sensing(dataclasses.replace(SMALL, model=name), sights)
     model = make_model(config, Classes(names, tuple(range(7))))
-    obs = samples.one_per_class(samples.observations(2, B)).replace(odometry=samples.odometry(2, B))
+    sensed = samples.odometry(2, B, sights=sights)
+    obs = samples.one_per_class(samples.observations(2, B)).replace(odometry=sensed)
 
     def answer(obs: Observation) -> Any:
         weights = model.initialise(jax.random.key(0), WORDS)
@@ -172,7 +179,7 @@ def test_every_named_model_takes_odometry(name: str) -> None:
         jax.eval_shape(answer, obs.replace(odometry=None))
     weights, out = jax.eval_shape(answer, obs)
     assert out.logits.shape == (2, B, 6)
-    assert weights["way"]["kernel"].shape == (741, ODOMETRY_UNITS)
+    assert weights["way"]["kernel"].shape == (741 + 9 * sights, ODOMETRY_UNITS)
 
 
 @pytest.mark.slow
