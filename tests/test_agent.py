@@ -111,7 +111,7 @@ def decide_alike(agent, some_rooms, glove, merge, rotation=0, steps=3):
 
 
 @pytest.mark.parametrize("rotation", [0, 225])
-@pytest.mark.parametrize("who", ["agent", "sensing_agent", "sighting_agent", "merging_agent"])
+@pytest.mark.parametrize("who", ["agent", "sighting_agent", "merging_agent"])
 def test_it_decides_as_the_network_does_in_the_environment(
     some_rooms, glove, who, rotation, request
 ):

@@ -28,7 +28,7 @@ class Fault(NamedTuple):
 
 
 ENV, LEARNER, TDANET = "env.py", "learner.py", "models/tdanet.py"
-ODOMETRY = "odometry.py"
+ODOMETRY, TRIANGULATION = "odometry.py", "triangulation.py"
 TEST_TDANET = "models/test_tdanet.py"
 FAULTS = (
     Fault("rotation sign", ODOMETRY, "Action.ROTATE_RIGHT, 1, 0", "Action.ROTATE_RIGHT, -1, 0",
@@ -61,6 +61,29 @@ FAULTS = (
     Fault("the map ends", ODOMETRY, "[heading]) & (MAP - 1)", "[heading])", "test_odometry.py"),
     Fault("every start is along an axis", ENV, "begin(rotation & 1,", "begin(rotation & 0,",
           "test_odometry.py"),
+    Fault("the target moves along", TRIANGULATION, "moment - sighting.normal @ moved",
+          "moment + sighting.normal @ moved", "test_triangulation.py"),
+    Fault("the target's place is never moved", ODOMETRY,
+          "triangulation.follow(sighting, cell - trail.cell)", "sighting", "test_triangulation.py"),
+    Fault("rays of a level camera", TRIANGULATION, "down = horizon *", "down = 0 * horizon *",
+          "test_triangulation.py"),
+    Fault("no guess", TRIANGULATION, "GUESS = 1e-3", "GUESS = 0.0", "test_triangulation.py"),
+    Fault("a guess as good as a ray", TRIANGULATION, "GUESS = 1e-3", "GUESS = 1.0",
+          "test_triangulation.py"),
+    Fault("any box is the one seen before", TRIANGULATION, "known = jnp.max(likeness) > SAME",
+          "known = sighting.normal[0, 0] > 0", "test_triangulation.py"),
+    Fault("it goes on with any of several", TRIANGULATION,
+          "jnp.where(known, jnp.argmax(likeness), largest)", "largest", "test_triangulation.py"),
+    Fault("it begins with the smallest", TRIANGULATION, "jnp.where(is_target, boxes[:, 2], -1.0)",
+          "jnp.where(is_target, -boxes[:, 2], -2.0)", "test_triangulation.py"),
+    Fault("a radius out of view is none", TRIANGULATION, "moment - sighting.normal @ moved)",
+          "moment - sighting.normal @ moved, radius=jnp.zeros(()))", "test_triangulation.py"),
+    Fault("certain of everything", TRIANGULATION, "within * certain,", "within,",
+          "test_triangulation.py"),
+    Fault("an agent that never looks", "agent.py", "is_target = obs.mask &",
+          "is_target = ~obs.mask &", "test_agent.py"),
+    Fault("nothing is seen at the start", ENV, "trail=_look(trail, state, params))\n    return state",
+          "trail=trail)\n    return state", "test_triangulation.py"),
     Fault("the way goes on in the next episode", LEARNER, "env.choose(over, begun, moved.state)",
           "env.choose(over, begun, moved.state).replace(trail=moved.state.trail)",
           "test_learner.py"),

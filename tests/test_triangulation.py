@@ -219,6 +219,122 @@ def filled(walk: list[tuple[int, bool]]) -> tuple[np.ndarray, np.ndarray]:
     return np.array([a for a, _ in rows], np.int32), np.array([b for _, b in rows])
 
 
+# Known places
+
+
+def walked_past(
+    place: np.ndarray,
+    size: float,
+    walk: list[tuple[int, bool]],
+    diagonal: bool = False,
+    last: int = LONGEST,
+) -> tuple[list[SlowTrail], np.ndarray, int]:
+    """Where one stands at each step, what is sensed of a target, and how often it was in view.
+
+    After the step `last` the agent sees no more.
+    """
+    ways, seen, way = [], [], SlowTrail(diagonal, 0)
+    for t in range(len(walk) + 1):
+        if t:
+            way.follow(*walk[t - 1])
+        ways.append(copy.copy(way))
+        box = box_of(way, place, size) if t <= last else None
+        seen.append([] if box is None else [box])
+    frames = frames_of(seen, np.random.default_rng(0))
+    _, sensed = walked(diagonal, 0, *filled(walk), frames)
+    return ways, np.asarray(sensed)[: len(walk) + 1], sum(map(bool, seen))
+
+
+AHEAD = [(MOVE_AHEAD, False)]
+
+
+def from_start(side: int, right: float, up: float, ahead: float, diagonal: bool) -> np.ndarray:
+    """A point to the right or left, up and ahead of the start as it faces, in metres."""
+    x, y, z = axes(45 * diagonal)
+    return np.asarray(side * right * x + up * y + ahead * z)
+
+
+@pytest.mark.parametrize("place", [(0.8, 0.3, 3.0), (-1.0, -0.6, 2.0), (0.1, 0.0, 0.7)])
+def test_one_sighting_is_a_place_within_reach_and_hardly_certain(place: tuple) -> None:
+    target = np.array(place)
+    ways, sensed, _ = walked_past(target, 0.3, 10 * AHEAD, last=0)
+    guess = 1.5 * target / np.linalg.norm(target)
+    box = box_of(ways[0], target, 0.3)
+    assert box is not None
+    for way, row in zip(ways, sensed, strict=True):
+        np.testing.assert_allclose(4 * row[:3], guess - camera(way), atol=2e-3)
+        np.testing.assert_allclose(row[3], min(1.5 * math.sqrt(box.area), 1.0), rtol=1e-3)
+    assert 0.01 < sensed[0, 4] < 0.05
+
+
+@pytest.mark.parametrize("horizon", [0, 1])
+@pytest.mark.parametrize("turns", range(8))
+def test_the_first_guess_lies_along_the_ray_wherever_one_looks(turns: int, horizon: int) -> None:
+    way, box = SlowTrail(False, horizon), Box(0.8, 0.3, 0.1)
+    walk = turns * [(ROTATE_RIGHT, False)]
+    for action in walk:
+        way.follow(*action)
+    frames = frames_of([*([] for _ in walk), [box]], np.random.default_rng(0))
+    _, sensed = walked(False, horizon, *filled(walk), frames)
+    right, up, ahead = axes(way.heading)
+    expected = [1.5 * float(ray(way, box) @ axis) for axis in (right, up, ahead)]
+    np.testing.assert_allclose(4 * np.asarray(sensed[turns, :3]), expected, atol=2e-3)
+    # What is seen depends on the horizon; a camera that looks down sees the floor in its middle.
+    assert expected[1] == pytest.approx(1.5 * (0.4, -0.12)[horizon] / math.sqrt(1.52), abs=5e-3)
+
+
+def test_nothing_is_sensed_before_the_target_was_seen() -> None:
+    for walk in ([], 10 * AHEAD, [(LOOK_DOWN, False), (ROTATE_LEFT, False), *AHEAD]):
+        behind = from_start(1, 0.0, 0.0, -3.0, diagonal=False)
+        _, sensed, times = walked_past(behind, 1.0, walk)
+        assert times == 0
+        np.testing.assert_array_equal(sensed, np.zeros((len(walk) + 1, 9)))
+
+
+@pytest.mark.parametrize("size", [0.2, 0.6, 3.0])
+def test_the_radius_is_half_a_side_at_the_distance_and_how_far_the_reach_goes(size: float) -> None:
+    target = from_start(1, 0.8, 0.0, 3.0, diagonal=False)
+    ways, sensed, times = walked_past(target, size, 10 * AHEAD)
+    assert 6 < times <= 10
+    away = 4 * np.linalg.norm(sensed[:, :3], axis=1)
+    boxes = [box_of(way, target, size) for way in ways[:times]]
+    half = [math.sqrt(box.area) * far for box, far in zip(boxes, away, strict=False) if box]
+    np.testing.assert_allclose(sensed[:times, 3], np.minimum(half, 1.0), rtol=1e-4)
+    # Out of view it stays as it was last seen.
+    np.testing.assert_array_equal(sensed[times:, 3], sensed[times - 1, 3])
+    level = 4 * np.hypot(sensed[:, 0], sensed[:, 2])
+    for column, near in ((5, 0.0), (6, sensed[:, 3])):
+        within = np.clip((1.5 - level + near) / 0.25, -1, 1)
+        np.testing.assert_allclose(sensed[:, column], within, atol=1e-4)
+        certainly = sensed[:, column] * sensed[:, 4]
+        np.testing.assert_allclose(sensed[:, column + 2], certainly, atol=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [5.0, 10.0, 14.0, 20.0])
+def test_of_several_it_goes_on_with_the_one_it_saw_or_begins_with_the_largest(
+    degrees: float,
+) -> None:
+    known, large = Box(0.5, 0.5, 0.01), Box(0.1, 0.5, 0.3)
+    moved = known._replace(x=0.5 + math.tan(math.radians(degrees)) / 2)
+    frames = frames_of([[known], [moved, large]], np.random.default_rng(0))
+    _, sensed = walked(False, 0, *filled([(LOOK_UP, False)]), frames)
+    right, _, ahead, *_ = np.asarray(sensed[1])
+    found = math.degrees(math.atan2(right, ahead))
+    if degrees < 12:  # between the rays to the one that it knows
+        assert found == pytest.approx(degrees / 2, abs=0.1)
+    else:
+        assert found == pytest.approx(-math.degrees(math.atan(0.8)), abs=0.1)
+        assert 4 * math.hypot(right, ahead) == pytest.approx(1.5, abs=1e-3)
+
+
+# On any walk
+
+
+PLACES = st.tuples(
+    st.sampled_from((-1, 1)), st.floats(0.8, 1.2), st.floats(-0.7, 0.4), st.floats(3.0, 4.0)
+)
+
+
 class Story(NamedTuple):
     """A walk past some targets, and what the slow one senses of them."""
 
@@ -281,44 +397,6 @@ def test_every_step_is_that_of_the_slow_sighting(
     assert_as_told(told(diagonal, horizon, runs, seed, noise), diagonal, horizon)
 
 
-# Known places
-
-
-def walked_past(
-    place: np.ndarray,
-    size: float,
-    walk: list[tuple[int, bool]],
-    diagonal: bool = False,
-    last: int = LONGEST,
-) -> tuple[list[SlowTrail], np.ndarray, int]:
-    """Where one stands at each step, what is sensed of a target, and how often it was in view.
-
-    After the step `last` the agent sees no more.
-    """
-    ways, seen, way = [], [], SlowTrail(diagonal, 0)
-    for t in range(len(walk) + 1):
-        if t:
-            way.follow(*walk[t - 1])
-        ways.append(copy.copy(way))
-        box = box_of(way, place, size) if t <= last else None
-        seen.append([] if box is None else [box])
-    frames = frames_of(seen, np.random.default_rng(0))
-    _, sensed = walked(diagonal, 0, *filled(walk), frames)
-    return ways, np.asarray(sensed)[: len(walk) + 1], sum(map(bool, seen))
-
-
-AHEAD = [(MOVE_AHEAD, False)]
-PLACES = st.tuples(
-    st.sampled_from((-1, 1)), st.floats(0.8, 1.2), st.floats(-0.7, 0.4), st.floats(3.0, 4.0)
-)
-
-
-def from_start(side: int, right: float, up: float, ahead: float, diagonal: bool) -> np.ndarray:
-    """A point to the right or left, up and ahead of the start as it faces, in metres."""
-    x, y, z = axes(45 * diagonal)
-    return np.asarray(side * right * x + up * y + ahead * z)
-
-
 @settings(max_examples=25)
 @given(place=PLACES, diagonal=st.booleans(), size=st.floats(0.05, 2.0))
 def test_what_is_passed_is_found_to_within_centimetres_whatever_its_size(
@@ -353,66 +431,6 @@ def test_who_stands_still_senses_the_same_in_another_direction(
     for way, row in zip(ways[4:], sensed[4:], strict=True):
         np.testing.assert_allclose(row[3:], sensed[4, 3:], atol=2e-5)
         np.testing.assert_allclose(np.stack(axes(way.heading)).T @ row[:3], there, atol=1e-5)
-
-
-@settings(max_examples=25)
-@given(place=PLACES, moves=st.integers(0, 10), size=st.floats(0.05, 2.0))
-def test_one_sighting_is_a_place_within_reach_and_hardly_certain(
-    place: tuple, moves: int, size: float
-) -> None:
-    target = from_start(*place, diagonal=False)
-    ways, sensed, _ = walked_past(target, size, moves * AHEAD, last=0)
-    guess = 1.5 * target / np.linalg.norm(target)
-    box = box_of(ways[0], target, size)
-    assert box is not None
-    for way, row in zip(ways, sensed, strict=True):
-        np.testing.assert_allclose(4 * row[:3], guess - camera(way), atol=2e-3)
-        np.testing.assert_allclose(row[3], min(1.5 * math.sqrt(box.area), 1.0), rtol=1e-3)
-    assert 0.01 < sensed[0, 4] < 0.05
-
-
-def test_nothing_is_sensed_before_the_target_was_seen() -> None:
-    for walk in ([], 10 * AHEAD, [(LOOK_DOWN, False), (ROTATE_LEFT, False), *AHEAD]):
-        behind = from_start(1, 0.0, 0.0, -3.0, diagonal=False)
-        _, sensed, times = walked_past(behind, 1.0, walk)
-        assert times == 0
-        np.testing.assert_array_equal(sensed, np.zeros((len(walk) + 1, 9)))
-
-
-@pytest.mark.parametrize("size", [0.2, 0.6, 3.0])
-def test_the_radius_is_half_a_side_at_the_distance_and_how_far_the_reach_goes(size: float) -> None:
-    target = from_start(1, 0.8, 0.0, 3.0, diagonal=False)
-    ways, sensed, times = walked_past(target, size, 10 * AHEAD)
-    assert 6 < times <= 10
-    away = 4 * np.linalg.norm(sensed[:, :3], axis=1)
-    boxes = [box_of(way, target, size) for way in ways[:times]]
-    half = [math.sqrt(box.area) * far for box, far in zip(boxes, away, strict=False) if box]
-    np.testing.assert_allclose(sensed[:times, 3], np.minimum(half, 1.0), rtol=1e-4)
-    # Out of view it stays as it was last seen.
-    np.testing.assert_array_equal(sensed[times:, 3], sensed[times - 1, 3])
-    level = 4 * np.hypot(sensed[:, 0], sensed[:, 2])
-    for column, near in ((5, 0.0), (6, sensed[:, 3])):
-        within = np.clip((1.5 - level + near) / 0.25, -1, 1)
-        np.testing.assert_allclose(sensed[:, column], within, atol=1e-4)
-        certainly = sensed[:, column] * sensed[:, 4]
-        np.testing.assert_allclose(sensed[:, column + 2], certainly, atol=1e-6)
-
-
-@pytest.mark.parametrize("degrees", [5.0, 10.0, 14.0, 20.0])
-def test_of_several_it_goes_on_with_the_one_it_saw_or_begins_with_the_largest(
-    degrees: float,
-) -> None:
-    known, large = Box(0.5, 0.5, 0.01), Box(0.1, 0.5, 0.3)
-    moved = known._replace(x=0.5 + math.tan(math.radians(degrees)) / 2)
-    frames = frames_of([[known], [moved, large]], np.random.default_rng(0))
-    _, sensed = walked(False, 0, *filled([(LOOK_UP, False)]), frames)
-    right, _, ahead, *_ = np.asarray(sensed[1])
-    found = math.degrees(math.atan2(right, ahead))
-    if degrees < 12:  # between the rays to the one that it knows
-        assert found == pytest.approx(degrees / 2, abs=0.1)
-    else:
-        assert found == pytest.approx(-math.degrees(math.atan(0.8)), abs=0.1)
-        assert 4 * math.hypot(right, ahead) == pytest.approx(1.5, abs=1e-3)
 
 
 def test_compiled_is_eager_and_many_are_one_by_one() -> None:
