@@ -279,8 +279,9 @@ def test_the_first_guess_lies_along_the_ray_wherever_one_looks(turns: int, horiz
     right, up, ahead = axes(way.heading)
     expected = [1.5 * float(ray(way, box) @ axis) for axis in (right, up, ahead)]
     np.testing.assert_allclose(4 * np.asarray(sensed[turns, :3]), expected, atol=2e-3)
-    # What is seen depends on the horizon; a camera that looks down sees the floor in its middle.
-    assert expected[1] == pytest.approx(1.5 * (0.4, -0.12)[horizon] / math.sqrt(1.52), abs=5e-3)
+    # Up by hand: the box is as much as 0.4 over the middle where the image ends at 1.
+    level = 0.4 * math.cos(math.pi / 6) - 0.5 if horizon else 0.4
+    assert expected[1] == pytest.approx(1.5 * level / math.sqrt(0.6**2 + 0.4**2 + 1))
 
 
 def test_nothing_is_sensed_before_the_target_was_seen() -> None:
