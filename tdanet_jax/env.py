@@ -259,8 +259,6 @@ def start(
 
 def _look(trail: Trail, state: EnvState, params: EnvParams) -> Trail:
     """The trail, once the agent has seen what is in view."""
-    if trail.sighting is None:
-        return trail
     classes, boxes, mask = _in_view(state, params)
     return odometry.look(trail, boxes, mask & (classes == params.target_class[state.target]))
 

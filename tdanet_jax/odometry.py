@@ -137,10 +137,10 @@ def follow(trail: Trail, action: jax.Array, blocked: jax.Array) -> Trail:
 
 
 def look(trail: Trail, boxes: jax.Array, is_target: jax.Array) -> Trail:
-    """The trail, once the agent has seen where its target is in view.
+    """The trail, once the agent has seen where its target is in view, if it senses that.
 
     Args:
-      trail: of an agent that senses the target's place; others have no use for this.
+      trail: behind the last action.
       boxes: [K, 3] x, y, S of the detections.
       is_target: [K] bool, False in padding.
     """
