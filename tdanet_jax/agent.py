@@ -62,6 +62,7 @@ class Memory(NamedTuple):
     previous: jax.Array  # [1, 6], action probabilities of the step before
     action: jax.Array  # int32, the action before; 6 at the start
     trail: Trail | None  # the way up to that action; if the network senses it
+    target: jax.Array  # int32, what it looked for in the step before; -1 at the start
 
 
 class Decision(NamedTuple):
@@ -124,6 +125,7 @@ class Agent:
             previous=jnp.zeros((1, NUM_ACTIONS)),
             action=jnp.int32(NUM_ACTIONS),
             trail=trail,
+            target=jnp.int32(-1),
         )
 
     def act(
@@ -232,15 +234,17 @@ class Agent:
         trail = memory.trail
         if trail is not None:
             trail = odometry.follow(trail, memory.action, blocked)
-            is_target = obs.mask & (obs.classes == obs.target[:, None])
-            trail = odometry.look(trail, obs.boxes[0], is_target[0])
+            is_target = obs.mask[0] & (obs.classes[0] == obs.target[0])
+            trail = odometry.forget(trail, memory.target != obs.target[0])
+            trail = odometry.look(trail, obs.boxes[0], is_target)
             obs = obs.replace(odometry=jax.tree.map(lambda x: x[None], odometry.sense(trail)))
         variables = {"params": weights}
         attention: Any = self.model.apply(variables, table, obs, method="attention")
         carry, out = actor_critic.forward(
             self.model, weights, table, memory.carry, obs, memory.previous, jnp.zeros(1, bool)
         )
-        return Memory(carry, jax.nn.softmax(out.logits), memory.action, trail), out, attention
+        previous = jax.nn.softmax(out.logits)
+        return Memory(carry, previous, memory.action, trail, obs.target[0]), out, attention
 
 
 def load(run: Path | str) -> Agent:

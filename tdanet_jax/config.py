@@ -74,8 +74,9 @@ class LearnerConfig:
     (Eq. 3). similarity: 0.1 times the cosine between the word vectors of the target and of a class
     in view, when it is the largest of the episode so far (SSNet). none: nothing."""
     size_noise: float = 0.0
-    """In each training episode the target looks larger or smaller by another factor, between e^-x
-    and e^x, so that the agent does not rely on how large things are. Beyond the paper."""
+    """In each training episode the sides of the target's boxes are multiplied by another factor,
+    between e^-x and e^x, so that the agent does not rely on how large things are. Beyond the
+    paper."""
     bootstrap_truncated: bool = True
     """Values the state in which a time-out cut an episode; False takes it for an end, as the
     reference does."""
@@ -105,7 +106,7 @@ class NetworkConfig:
     relative to its start, and a map of where it has been. Beyond the paper; any model takes it."""
     triangulation: bool = False
     """Lets an agent with --odometry also sense where its target is, from the directions in which
-    its boxes were seen on the way. Beyond the paper; any model takes it."""
+    its boxes were seen on the way. Beyond the paper; for models that see a box of every object."""
     inner_rate: float = 1e-4
     """Size of the inner gradient steps of the models that adapt."""
     first_order: bool = False
@@ -201,7 +202,6 @@ class TrainConfig:
             "--entropy-weight": self.learner.entropy_weight,
             "--final-entropy-weight": self.learner.final_entropy_weight,
             "--value-weight": self.learner.value_weight,
-            "--size-noise": self.learner.size_noise,
         }
         for flag, value in not_negative.items():
             if value < 0:
@@ -209,7 +209,11 @@ class TrainConfig:
         if self.network.image == "features" and self.data is None:
             raise ValueError("--image features: needs --data, rooms that were imported with them")
         if self.network.triangulation and not self.network.odometry:
-            raise ValueError("--triangulation: needs --odometry")
+            raise ValueError("--triangulation: needs --odometry (or use --no-triangulation)")
+        if self.network.triangulation and self.network.rows != "object":
+            raise ValueError(f"--rows {self.network.rows}: --triangulation needs a row per object")
+        if not 0 <= self.learner.size_noise <= 2:
+            raise ValueError(f"--size-noise {self.learner.size_noise}: must be between 0 and 2")
         shares = {
             "--gamma": self.learner.gamma,
             "--gae-lambda": self.learner.gae_lambda,

@@ -59,7 +59,7 @@ class EnvParams(struct.PyTreeNode):
     max_detections: int = struct.field(pytree_node=False)  # K, most detections in any pose
     odometry: bool = struct.field(pytree_node=False, default=False)  # the agent senses its way
     triangulation: bool = struct.field(pytree_node=False, default=False)  # and the target's place
-    size_noise: float = struct.field(pytree_node=False, default=0.0)  # see `_size_factor`
+    size_noise: float = struct.field(pytree_node=False, default=0.0)  # see `_draw_area_factor`
 
 
 class EnvState(struct.PyTreeNode):
@@ -71,7 +71,7 @@ class EnvState(struct.PyTreeNode):
     parents_seen: jax.Array  # int32, bit set over the target's three parents
     shortest: jax.Array  # int32, L: actions on the optimal path from the start, Done included
     similarity: jax.Array | None = None  # float32, largest cosine so far, if it is paid for
-    size: jax.Array | None = None  # float32, factor of the areas of the target's boxes, if any
+    area_factor: jax.Array | None = None  # float32, of the target's boxes, if there is size noise
     trail: Trail | None = None  # the way so far, if the agent senses it
 
 
@@ -128,7 +128,7 @@ def make_params(
       scenes: the rooms in which `reset` begins an episode; by default all.
       odometry: observations hold what the agent senses of its own way, too.
       triangulation: and where it senses its target.
-      size_noise: each episode's target looks larger or smaller by up to this, as a logarithm.
+      size_noise: x, where the sides of a target's boxes are multiplied by e^-x to e^x.
 
     Raises:
       ValueError: no episode is possible.
@@ -236,9 +236,9 @@ def _pick_from(bits: jax.Array, span: jax.Array) -> jax.Array:
 
 
 def start(
-    params: EnvParams, pose: jax.Array, target: jax.Array, size: jax.Array | None = None
+    params: EnvParams, pose: jax.Array, target: jax.Array, area_factor: jax.Array | None = None
 ) -> EnvState:
-    """The state at the start of the given episode, with a `size` other than the target's own."""
+    """The state at the start of the given episode."""
     zero = jnp.zeros_like(pose)
     _, rotation, horizon = poses.split(pose)
     shortest = params.distance[pose, target].astype(jnp.int32) + 1
@@ -249,7 +249,7 @@ def start(
         parents_seen=zero,
         shortest=shortest,
         similarity=None if params.similarity is None else jnp.zeros_like(pose, jnp.float32),
-        size=size,
+        area_factor=area_factor,
     )
     if params.odometry:
         trail = odometry.begin(rotation & 1, horizon, params.triangulation)
@@ -275,17 +275,14 @@ def reset_state(key: jax.Array, params: EnvParams) -> EnvState:
     pair = _pick_from(bits[2], params.scene_pairs[scene])
     position = params.start_position[_pick_from(bits[3], params.pair_starts[pair])]
     rotation = (bits[0] & 7).astype(jnp.int32)  # bits that the choice of the room does not use
-    size = _size_factor(key, params.size_noise) if params.size_noise else None
-    return start(params, poses.join(position, rotation), params.pair_target[pair], size)
+    factor = _draw_area_factor(key, params.size_noise) if params.size_noise else None
+    return start(params, poses.join(position, rotation), params.pair_target[pair], factor)
 
 
-def _size_factor(key: jax.Array, noise: float) -> jax.Array:
-    """A factor for the areas of a target's boxes, of which the sides' is between e^-noise, e^noise.
-
-    An agent that is to find what it never had to find should not rely on how large things are.
-    """
-    share = jax.random.uniform(jax.random.fold_in(key, 0), minval=-1.0, maxval=1.0)
-    return jnp.exp(2 * noise * share)
+def _draw_area_factor(key: jax.Array, noise: float) -> jax.Array:
+    """The square of a factor of the sides of boxes, log-uniform from e^-noise to e^noise."""
+    own = jax.random.fold_in(key, 0)  # not `key`: with or without noise, episodes are the same
+    return jnp.exp(2 * jax.random.uniform(own, minval=-noise, maxval=noise))
 
 
 def reset(key: jax.Array, params: EnvParams) -> tuple[Observation, EnvState]:
@@ -323,9 +320,9 @@ def _in_view(state: EnvState, params: EnvParams) -> tuple[jax.Array, jax.Array, 
     boxes = jax.lax.dynamic_slice(params.row_box.reshape(-1), (3 * first,), (3 * longest,))
     inside = jnp.arange(3 * longest, dtype=jnp.int32) < 3 * (last - first)
     boxes = jnp.where(inside, boxes, 0.0).reshape(longest, 3)
-    if state.size is not None:
+    if state.area_factor is not None:
         is_target = classes == params.target_class[state.target]
-        area = jnp.minimum(boxes[:, 2] * jnp.where(is_target, state.size, 1.0), 1.0)
+        area = jnp.minimum(boxes[:, 2] * jnp.where(is_target, state.area_factor, 1.0), 1.0)
         boxes = boxes.at[:, 2].set(area)
     return jnp.where(mask, classes, 0), boxes, mask
 

@@ -3,8 +3,8 @@
 Nothing here knows the room. An agent knows which action it took and whether a MoveAhead was
 blocked; from these follow its pose relative to the start, and a map of where it has been and of
 what was in the way. It senses the pose (as from the GPS and compass of Habitat) and the part of the
-map around it, turned so that ahead is up. The environment and an agent on its own run the same
-functions.
+map around it, turned so that ahead is up. It may also keep in mind where it saw its target
+(`triangulation.py`). The environment and an agent on its own run the same functions.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MAP = 64
 WINDOW = 9
 #: Bits of a cell: one for each heading in which the agent stood there, then "blocked".
 BLOCKED = 1 << ROTATIONS
-#: Length of `numbers`.
+#: Length of `numbers`, without the target's.
 NUMBERS = 6 + NUM_ACTIONS + WINDOW * WINDOW * (ROTATIONS + 1)
 #: Metres are divided by this many cells (4 m).
 REACH = 16.0
@@ -77,13 +77,13 @@ class Odometry(struct.PyTreeNode):
     target: jax.Array | None = None  # [9] float32, `triangulation.sense`; if it senses that
 
 
-def begin(diagonal: jax.Array, horizon: jax.Array, sights: bool = False) -> Trail:
+def begin(diagonal: jax.Array, horizon: jax.Array, triangulates: bool = False) -> Trail:
     """The trail at the start of an episode.
 
     Args:
       diagonal: int32, 1 if the agent faces along a diagonal of the grid, 0 if along an axis.
       horizon: int32, 1 while looking down.
-      sights: whether the agent senses the target's place, too.
+      triangulates: whether the agent senses its target's place, too.
     """
     cells = jnp.zeros((MAP, MAP), jnp.uint16).at[0, 0].set((1 << diagonal).astype(jnp.uint16))
     return Trail(
@@ -93,7 +93,7 @@ def begin(diagonal: jax.Array, horizon: jax.Array, sights: bool = False) -> Trai
         action=jnp.full_like(diagonal, NUM_ACTIONS),
         blocked=jnp.zeros_like(diagonal, bool),
         cells=cells,
-        sighting=triangulation.begin() if sights else None,
+        sighting=triangulation.begin() if triangulates else None,
     )
 
 
@@ -134,6 +134,13 @@ def follow(trail: Trail, action: jax.Array, blocked: jax.Array) -> Trail:
         cells=trail.cells.at[at].set(trail.cells[at] | bit),
         sighting=sighting,
     )
+
+
+def forget(trail: Trail, lost: jax.Array) -> Trail:
+    """The trail, without what it knows of a target's place if that is `lost`, a bool."""
+    if trail.sighting is None:
+        return trail
+    return trail.replace(sighting=triangulation.forget(trail.sighting, lost))
 
 
 def look(trail: Trail, boxes: jax.Array, is_target: jax.Array) -> Trail:
@@ -177,7 +184,8 @@ def numbers(sensed: Odometry) -> jax.Array:
     return jnp.concatenate([sensed.motion, flat.astype(jnp.float32), *target], axis=-1)
 
 
-def sensed_at_start(batch: int, sights: bool) -> Odometry:
+def sensed_at_start(batch: int, triangulates: bool) -> Odometry:
     """What is sensed at the start of `batch` episodes, along an axis."""
     zero = jnp.zeros(batch, jnp.int32)
-    return jax.vmap(lambda diagonal, horizon: sense(begin(diagonal, horizon, sights)))(zero, zero)
+    begun = jax.vmap(lambda diagonal, horizon: begin(diagonal, horizon, triangulates))
+    return jax.vmap(sense)(begun(zero, zero))

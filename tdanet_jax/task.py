@@ -229,7 +229,7 @@ def resolve_precision(config: NetworkConfig) -> NetworkConfig:
 
 
 def without_effect(config: TrainConfig, classes: Classes) -> list[str]:
-    """The flags of the network that are set and change nothing for this model, if it is ours."""
+    """The flags of what it sees that are set and change nothing for this model, if it is ours."""
     network, default = config.network, NetworkConfig()
     if config.model not in MODELS:
         return []
@@ -249,14 +249,16 @@ def without_effect(config: TrainConfig, classes: Classes) -> list[str]:
 
     names = [field.name for field in dataclasses.fields(network) if field.name != "word_norm"]
     chosen = [name for name in names if getattr(network, name) != getattr(default, name)]
-    return [f"--{name.replace('_', '-')}" for name in chosen if idle(name)]
+    flags = [f"--{name.replace('_', '-')}" for name in chosen if idle(name)]
+    return [*flags, "--size-noise"] if config.learner.size_noise and model.encoder.IMAGE else flags
 
 
 def make_model(config: TrainConfig, classes: Classes) -> ActorCritic:
     """The network of a configuration.
 
     Raises:
-      ValueError: `config.model` names a module that cannot be imported or makes no `ActorCritic`.
+      ValueError: `config.model` names a module that cannot be imported or makes no `ActorCritic`,
+        or cannot triangulate.
     """
     module_name, options = MODELS.get(config.model, (config.model, {}))
     try:
@@ -270,4 +272,12 @@ def make_model(config: TrainConfig, classes: Classes) -> ActorCritic:
     model = module.make(network, classes, dtype, **options)
     if not isinstance(model, ActorCritic):
         raise ValueError(f"--model {config.model}: `make` gives no ActorCritic")
-    return model.clone(odometry=network.odometry, triangulation=network.triangulation)
+    if network.triangulation and (model.encoder.IMAGE or model.encoder.ROWS == "class"):
+        raise ValueError(
+            f"--triangulation: {config.model} is not shown a box of every object; "
+            "use --no-triangulation"
+        )
+    return model.clone(
+        odometry=network.odometry or model.odometry,
+        triangulation=network.triangulation or model.triangulation,
+    )

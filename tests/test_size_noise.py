@@ -55,7 +55,7 @@ def test_the_targets_boxes_alone_grow_and_by_one_factor_an_episode(pairs: tuple)
     chex.assert_trees_all_equal(obs.replace(boxes=truth.boxes), truth)
     is_target = truth.mask & (truth.classes == truth.target[..., None])
     assert is_target.any(-1).sum() > 200
-    factor = np.where(is_target, state.size[..., None], 1)
+    factor = np.where(is_target, state.area_factor[..., None], 1)
     expected = np.minimum(np.asarray(truth.boxes[..., 2]) * factor, 1)
     np.testing.assert_allclose(obs.boxes[..., 2], expected, rtol=1e-6)
     np.testing.assert_array_equal(obs.boxes[..., :2], truth.boxes[..., :2])
@@ -63,7 +63,7 @@ def test_the_targets_boxes_alone_grow_and_by_one_factor_an_episode(pairs: tuple)
 
 def test_a_factor_lasts_for_an_episode_and_is_spread_over_its_range(pairs: tuple) -> None:
     state = pairs[1][0]
-    size, steps = np.asarray(state.size), np.asarray(state.steps)
+    size, steps = np.asarray(state.area_factor), np.asarray(state.steps)
     goes_on = steps[1:] > 0
     np.testing.assert_array_equal((size[1:] == size[:-1]), goes_on)
     sides = np.log(size[steps == 0]) / 2
@@ -83,7 +83,7 @@ def test_what_is_sensed_of_the_target_is_that_of_its_changed_boxes(some_rooms: S
     np.testing.assert_array_equal(seen[..., place], there[..., place])
     whole = (there[..., radius] < 0.6) & (seen[..., radius] < 0.6) & (there[..., radius] > 0)
     ratio = seen[..., radius][whole] / there[..., radius][whole]
-    np.testing.assert_allclose(ratio, np.sqrt(np.asarray(state.size))[whole], rtol=1e-4)
+    np.testing.assert_allclose(ratio, np.sqrt(np.asarray(state.area_factor))[whole], rtol=1e-4)
 
 
 def test_no_box_exceeds_the_image(some_rooms: SceneTables) -> None:
@@ -98,9 +98,9 @@ def test_no_box_exceeds_the_image(some_rooms: SceneTables) -> None:
 
 
 def test_without_noise_nothing_is_drawn(some_rooms: SceneTables) -> None:
-    assert env.reset_state(jax.random.key(0), params_of(some_rooms, 0.0)).size is None
+    assert env.reset_state(jax.random.key(0), params_of(some_rooms, 0.0)).area_factor is None
     start = jax.jit(env.start)(params_of(some_rooms, NOISE), jnp.int32(0), jnp.int32(0))
-    assert start.size is None  # a given episode is as it is
+    assert start.area_factor is None  # a given episode is as it is
 
 
 def test_training_alone_is_noisy(ithor: Rooms, glove: WordVectors) -> None:

@@ -46,6 +46,8 @@ class ActorCritic(nn.Module):
     triangulation: bool = False
 
     def setup(self) -> None:
+        if self.triangulation and not self.odometry:
+            raise ValueError("a network that senses its target's place senses its way, too")
         if self.odometry:
             self.way = Linear(ODOMETRY_UNITS)
         if self.encoder.ACTION != "plain":
