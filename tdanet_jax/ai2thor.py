@@ -38,7 +38,7 @@ SETTINGS: dict[str, Any] = {
 #: Object types that are parts of the building: the rooms in which agents are trained hold none.
 STRUCTURE = frozenset({IGNORED, "Ceiling", "Door", "Doorframe", "Doorway", "Room", "Wall"})
 
-#: Metres and degrees by which AI2-THOR may miss the pose that an action leads to.
+#: Metres and degrees by which AI2-THOR may miss the pose that the actions lead to.
 NEAR, ALIGNED = 0.05, 1.0
 
 
@@ -152,7 +152,7 @@ def play(
     event = controller.last_event
     places, decisions, unnamed = [_place(event)], [], set[str]()
     memory = agent.start(places[0].rotation, places[0].horizon)
-    blocked = False
+    expected, blocked = _on_the_grid(places[0]), False
     for step in range(step_limit):
         seen = detections(event)
         named = [found for found in seen if agent.knows(found.label)]
@@ -160,7 +160,7 @@ def play(
         now = None if key is None else jax.random.fold_in(key, step)
         memory, decision = agent.act(memory, named, target, now, blocked)
         decisions.append(decision)
-        event, blocked = _take(controller, event, decision.action)
+        event, expected, blocked = _take(controller, event, expected, decision.action)
         places.append(_place(event))
         if decision.action == Action.DONE:
             break
@@ -174,20 +174,33 @@ def _place(event: Event) -> Place:
     return Place(position["x"], position["z"], agent["rotation"]["y"], agent["cameraHorizon"])
 
 
-def _take(controller: Controller, event: Event, action: Action) -> tuple[Event, bool]:
-    """The frame behind an action, and whether it was a MoveAhead that was blocked.
+def _on_the_grid(place: Place) -> Place:
+    """With the angles that it means."""
+    rotation, horizon = (
+        45 * (round(place.rotation / 45) % ROTATIONS),
+        30 * round(place.horizon / 30),
+    )
+    return place._replace(rotation=rotation, horizon=horizon)
+
+
+def _take(
+    controller: Controller, event: Event, before: Place, action: Action
+) -> tuple[Event, Place, bool]:
+    """The frame behind an action, where the agent should be, and whether it was blocked.
+
+    Args:
+      before: where the agent should be before it; what AI2-THOR misses does not add up.
 
     Raises:
-      ValueError: AI2-THOR's agent is not where the action leads.
+      ValueError: AI2-THOR's agent is not where the actions so far lead.
     """
-    before = _place(event)
-    heading, down = round(before.rotation / 45) % ROTATIONS, round(before.horizon / 30)
+    heading, down = round(before.rotation / 45), round(before.horizon / 30)
     right = (action == Action.ROTATE_RIGHT) - (action == Action.ROTATE_LEFT)
     turned = (heading + right) % ROTATIONS
     looking = {Action.LOOK_UP: 0, Action.LOOK_DOWN: 1}.get(action, down)
     ahead = action == Action.MOVE_AHEAD
     if not ahead and (turned, looking) == (heading, down):
-        return event, False
+        return event, before, False
     dx, dz = (GRID * int(cells) for cells in STEPS[heading])
     arguments = {"moveMagnitude": math.hypot(dx, dz)} if ahead else {}
     event = controller.step(action=ACTION_NAMES[action], **arguments)
@@ -199,7 +212,7 @@ def _take(controller: Controller, event: Event, action: Action) -> tuple[Event, 
             f"{ACTION_NAMES[action]} from {before} led to {after} and not to {expected}; is the "
             f"controller made with SETTINGS? {event.metadata['errorMessage']}".rstrip()
         )
-    return event, ahead and not moved
+    return event, expected, ahead and not moved
 
 
 def _alike(one: Place, other: Place) -> bool:
