@@ -126,13 +126,17 @@ def train_all(
       configs: what to train.
     """
     from tdanet_jax import devices
-    from tdanet_jax.task import resolve
+    from tdanet_jax.classes import Classes
+    from tdanet_jax.task import make_model, resolve
 
     devices.connect(training.devices)
     devices.keep_compiled()
     configs = [resolve(config) for config in configs]
     folders = [command.out / sweep.run_name(config) for config in configs]
-    # All are looked at before the first trains: a clash shows at once, not after hours.
+    # All are looked at before the first trains: a clash shows at once, not after hours, and so does
+    # a model that cannot be made.
+    for config in configs:
+        make_model(config, Classes())
     states = [sweep.progress(*pair) for pair in zip(folders, configs, strict=True)]
     todo = [
         (config, folder)

@@ -38,6 +38,11 @@ RUN_FILES = {
         (["--out=x", "--seeds", "1", "1"], "--seeds: a value is given twice"),
         (["--out=x", "--stepz", "5"], "Unrecognized options: --stepz"),
         (["--out=x", "--vmap-seeds", "--minutes", "1"], "--vmap-seeds needs a budget in --steps"),
+        (
+            ["--out=x", "--models", "tdanet", "ssnet", "--preset", "best"],
+            "ssnet is not shown a box",
+        ),
+        (["--out=x", "--models", "tdanet", "no.such"], "--model no.such: No module named 'no'"),
         (["--out=x", "--report-only", "--steps", "5"], "--report-only trains nothing"),
         (["--out=x", "--report-only"], "x: no finished run"),
         (["--out=x", "--report-only", "--include", "y"], "y/config.json: no such file"),
