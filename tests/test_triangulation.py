@@ -34,7 +34,7 @@ from tests.test_odometry import NOTHING, RUNS, SlowTrail, toy_rooms
 
 #: A walk's actions are filled up to as many, and its frames up to as many boxes.
 LONGEST, K = 60, 6
-#: What the fast one may be off, in rounding errors of float32 for each sighting.
+#: What the fast one may be off, as a rounding error of float32 for each sum.
 ROUNDING = 4e-7
 
 
@@ -52,38 +52,84 @@ class SlowSighting:
     def __init__(self) -> None:
         self.rays: list[tuple[np.ndarray, np.ndarray]] = []  # from where, and where to
         self.radius = 0.0
+        self.stood: tuple[int, int] | None = None  # where it was asked for the last time
+        self.moved = False  # since the last ray
+        self.sums = 0  # rays and moves since the first ray
+
+    def arrive(self, way: SlowTrail) -> None:
+        """The agent stands here now; asked in every step, so that it knows who came back."""
+        here = way.x, way.z
+        if self.stood is not None and here != self.stood:
+            self.moved = True
+            self.sums += 1
+        self.stood = here
 
     def look(self, way: SlowTrail, boxes: list[Box]) -> None:
         """What is in view of the target, from where the agent stands and looks."""
+        self.arrive(way)
         if not boxes:
             return
-        away = [self.degrees(way, box) for box in boxes]
-        if min(away) < 12:
-            box = boxes[away.index(min(away))]
+        box = self.nearest(way, boxes)
+        if box is not None and self.degrees_with(way, box) < 12:
+            if self.moved:
+                self.rays.append((camera(way), ray(way, box)))
+                self.sums += 1
         else:
             box = max(boxes, key=lambda box: box.area)
-            self.rays = []
-        self.rays.append((camera(way), ray(way, box)))
-        self.radius = min(math.sqrt(box.area) * float(np.linalg.norm(self.seen_from(way))), 1.0)
+            self.rays, self.sums = [(camera(way), ray(way, box))], 1
+        self.moved = False
+        distance = float(np.linalg.norm(self.seen_from(way)))
+        _, _, ahead = axes(way.heading, 30 * way.horizon)
+        depth = distance * float(ray(way, box) @ ahead)
+        self.radius = min(math.sqrt(box.area) * depth, 1.0)
 
     def degrees(self, way: SlowTrail, box: Box) -> float:
         """How far a box is from where the target is believed to be, as one stands and looks."""
-        if not self.rays:
-            return 180.0
         return angle(ray(way, box), self.seen_from(way))
 
+    def nearest(self, way: SlowTrail, boxes: list[Box]) -> Box | None:
+        """The box of what was seen before, if it was that; None if nothing was."""
+        if not self.rays:
+            return None
+        return min(boxes, key=lambda box: self.degrees(way, box))
+
+    def following(self, way: SlowTrail, box: Box) -> SlowSighting:
+        """What is known if the box is of what was seen before."""
+        after = copy.copy(self)
+        if self.moved:
+            after.rays = [*self.rays, (camera(way), ray(way, box))]
+            after.sums += 1
+        return after
+
+    def degrees_with(self, way: SlowTrail, box: Box) -> float:
+        """How far a box is from the place that follows from it."""
+        return self.following(way, box).degrees(way, box)
+
     def unclear(self, way: SlowTrail, boxes: list[Box]) -> bool:
-        """Whether rounding might decide which box it is."""
-        if self.rays and float(np.linalg.norm(self.seen_from(way))) < 0.2:
-            return True  # it stands in the target
-        near = 1 + math.degrees(self.rounding(way))
-        away = sorted(self.degrees(way, box) for box in boxes)
+        """Whether rounding might decide which box it is, or whether it is of what was seen."""
+        self.arrive(way)
         area = sorted((box.area for box in boxes), reverse=True)
-        return (
-            any(abs(x - 12) < near for x in away)
-            or any(b - a < 2 * near for a, b in itertools.pairwise(away[:2]) if a < 12)
-            or any(a - b < 1e-5 for a, b in itertools.pairwise(area[:2]))
-        )
+        if any(a - b < 1e-5 for a, b in itertools.pairwise(area[:2])):
+            return True
+        if not self.rays or not boxes:
+            return False
+        off = self.degrees_off(way)
+        away = sorted(boxes, key=lambda box: self.degrees(way, box))
+        gap = self.degrees(way, away[min(1, len(away) - 1)]) - self.degrees(way, away[0])
+        tied = away if len(away) > 1 and gap < 2 * off else away[:1]
+        after = [self.following(way, box) for box in tied]
+        borders = [12 + known.degrees_off(way) for known in after]
+        if any(b - 12 > 180 for b in [12 + off, *borders]):
+            return True  # it stands in the target
+        ends = [known.degrees(way, box) for known, box in zip(after, tied, strict=True)]
+        if len(tied) > 1:
+            return any(end < border for end, border in zip(ends, borders, strict=True))
+        return abs(ends[0] - 12) < borders[0] - 12
+
+    def degrees_off(self, way: SlowTrail) -> float:
+        """By how much float32 may miss the direction of the place, and some more."""
+        distance = float(np.linalg.norm(self.seen_from(way)))
+        return math.inf if distance < 0.2 else 1 + math.degrees(self.rounding(way)) / distance
 
     def equations(self) -> tuple[np.ndarray, np.ndarray]:
         """Three rows for each ray: a point's distance from it; and for the guess, which is weak."""
@@ -118,7 +164,7 @@ class SlowSighting:
         rows, _ = self.equations()
         least = float(np.linalg.svd(rows, compute_uv=False)[-1]) ** 2
         far = 1 + float(np.linalg.norm(self.seen_from(way)))
-        return ROUNDING * len(self.rays) * far / least
+        return ROUNDING * self.sums * far / least
 
     def sense(self, way: SlowTrail) -> list[float]:
         """The nine numbers."""
@@ -208,7 +254,7 @@ def walked(
         trail = odometry.look(odometry.follow(trail, action, blocked), *frame)
         return trail, (trail.replace(cells=jnp.zeros(0)), odometry.sense(trail).target)
 
-    begun = odometry.begin(jnp.int32(diagonal), jnp.int32(horizon), sights=True)
+    begun = odometry.begin(jnp.int32(diagonal), jnp.int32(horizon), triangulates=True)
     actions = jnp.concatenate([jnp.array([NOTHING]), actions])
     return jax.lax.scan(step, begun, (actions, jnp.append(True, blocked), frames))[1]
 
@@ -259,11 +305,10 @@ def test_one_sighting_is_a_place_within_reach_and_hardly_certain(place: tuple) -
     target = np.array(place)
     ways, sensed, _ = walked_past(target, 0.3, 10 * AHEAD, last=0)
     guess = 1.5 * target / np.linalg.norm(target)
-    box = box_of(ways[0], target, 0.3)
-    assert box is not None
+    nearer = 1.5 / float(np.linalg.norm(target))  # a square of 0.3 m there looks as large
     for way, row in zip(ways, sensed, strict=True):
         np.testing.assert_allclose(4 * row[:3], guess - camera(way), atol=2e-3)
-        np.testing.assert_allclose(row[3], min(1.5 * math.sqrt(box.area), 1.0), rtol=1e-3)
+        np.testing.assert_allclose(row[3], 0.15 * nearer, rtol=1e-3)
     assert 0.01 < sensed[0, 4] < 0.05
 
 
@@ -293,14 +338,11 @@ def test_nothing_is_sensed_before_the_target_was_seen() -> None:
 
 
 @pytest.mark.parametrize("size", [0.2, 0.6, 3.0])
-def test_the_radius_is_half_a_side_at_the_distance_and_how_far_the_reach_goes(size: float) -> None:
+def test_the_radius_is_half_a_side_and_how_far_the_reach_goes(size: float) -> None:
     target = from_start(1, 0.8, 0.0, 3.0, diagonal=False)
     ways, sensed, times = walked_past(target, size, 10 * AHEAD)
     assert 6 < times <= 10
-    away = 4 * np.linalg.norm(sensed[:, :3], axis=1)
-    boxes = [box_of(way, target, size) for way in ways[:times]]
-    half = [math.sqrt(box.area) * far for box, far in zip(boxes, away, strict=False) if box]
-    np.testing.assert_allclose(sensed[:times, 3], np.minimum(half, 1.0), rtol=1e-4)
+    np.testing.assert_allclose(sensed[2:times, 3], min(size / 2, 1.0), rtol=0.03)
     # Out of view it stays as it was last seen.
     np.testing.assert_array_equal(sensed[times:, 3], sensed[times - 1, 3])
     level = 4 * np.hypot(sensed[:, 0], sensed[:, 2])
@@ -311,21 +353,132 @@ def test_the_radius_is_half_a_side_at_the_distance_and_how_far_the_reach_goes(si
         np.testing.assert_allclose(sensed[:, column + 2], certainly, atol=1e-6)
 
 
+@pytest.mark.parametrize("horizon", [0, 1])
+@pytest.mark.parametrize("side", [0.0, 0.7, -0.9])
+@pytest.mark.parametrize("up", [-0.9, -0.3, 0.2])
+def test_a_plate_that_faces_the_camera_has_its_true_radius_anywhere_in_view(
+    side: float, up: float, horizon: int
+) -> None:
+    """Its place is known from a walk; then it is looked at from a pose of which it is off axis."""
+    pose = SlowTrail(False, horizon)
+    right, above, ahead = axes(0, 30 * horizon)
+    for size, depth in ((0.3, 2.0), (1.0, 1.2)):
+        plate = depth * (ahead + side * right + up * above)
+        places = [np.array([x, 0.0, z]) for x, z in ((-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))]
+        known = triangulation.begin()
+        for place in places:
+            along = jnp.asarray(plate - place, jnp.float32)
+            known = along_ray(known, place, along / jnp.linalg.norm(along))
+        box = box_of(pose, plate, size)
+        assert box is not None
+        known = triangulation.look(
+            known, jnp.int32(0), jnp.int32(horizon), jnp.array([box]), jnp.array([True])
+        )
+        assert float(known.radius) == pytest.approx(size / 2, rel=1e-3)
+
+
+def along_ray(
+    known: triangulation.Sighting, start: np.ndarray, along: jax.Array
+) -> triangulation.Sighting:
+    """What is known behind one more ray, from somewhere other than where the agent stands."""
+    across = jnp.eye(3) - jnp.outer(along, along)
+    normal, moment = known.normal + across, known.moment + across @ jnp.asarray(start, jnp.float32)
+    return known.replace(normal=normal, moment=moment)
+
+
 @pytest.mark.parametrize("degrees", [5.0, 10.0, 14.0, 20.0])
+@pytest.mark.parametrize("walk", [[(LOOK_UP, False)], [(MOVE_AHEAD, True), (DONE, False)]])
 def test_of_several_it_goes_on_with_the_one_it_saw_or_begins_with_the_largest(
-    degrees: float,
+    degrees: float, walk: list
 ) -> None:
     known, large = Box(0.5, 0.5, 0.01), Box(0.1, 0.5, 0.3)
-    moved = known._replace(x=0.5 + math.tan(math.radians(degrees)) / 2)
-    frames = frames_of([[known], [moved, large]], np.random.default_rng(0))
-    _, sensed = walked(False, 0, *filled([(LOOK_UP, False)]), frames)
-    right, _, ahead, *_ = np.asarray(sensed[1])
+    other = known._replace(x=0.5 + math.tan(math.radians(degrees)) / 2)
+    frames = frames_of([[known], *([] for _ in walk[1:]), [other, large]], np.random.default_rng(0))
+    _, sensed = walked(False, 0, *filled(walk), frames)
+    right, _, ahead, radius, *_ = np.asarray(sensed[len(walk)])
     found = math.degrees(math.atan2(right, ahead))
-    if degrees < 12:  # between the rays to the one that it knows
-        assert found == pytest.approx(degrees / 2, abs=0.1)
+    assert 4 * math.hypot(right, ahead) == pytest.approx(1.5, abs=1e-3)
+    if degrees < 12:  # it is the one that it knows, and from here was known before
+        assert found == pytest.approx(0.0, abs=0.01)
+        deep = 1.5 * math.cos(math.radians(degrees))
+        assert radius == pytest.approx(0.1 * deep, abs=1e-4)
     else:
-        assert found == pytest.approx(-math.degrees(math.atan(0.8)), abs=0.1)
-        assert 4 * math.hypot(right, ahead) == pytest.approx(1.5, abs=1e-3)
+        assert found == pytest.approx(-math.degrees(math.atan(0.8)), abs=0.01)
+        deep = 1.5 * math.cos(math.atan(0.8))
+        assert radius == pytest.approx(math.sqrt(0.3) * deep, abs=1e-3)
+
+
+TURN = 2 * [(ROTATE_RIGHT, False)]  # a quarter
+TURN_BACK = 2 * [(ROTATE_LEFT, False)]
+
+
+@pytest.mark.parametrize("steps", [3, 5, 8])
+@pytest.mark.parametrize("place", [(0.0, 0.0, 3.0), (0.4, 0.3, 4.5), (-0.5, -0.6, 6.0)])
+def test_what_was_seen_once_is_found_from_far_beside(place: tuple, steps: int) -> None:
+    """It turns away, goes 0.75 to 2 m sideways without seeing it, and looks again."""
+    target = np.array(place)
+    if steps == 3 and place[2] == 6.0:
+        target = target / 2
+    walk = [*TURN, *steps * AHEAD, *TURN_BACK]
+    ways, sensed, times = walked_past(target, 0.3, walk)
+    boxes = [box_of(way, target, 0.3) for way in ways]
+    assert boxes[0] is not None
+    assert boxes[-1] is not None
+    blind = [way for way, box in zip(ways, boxes, strict=True) if box is None]
+    assert len(blind) >= steps + 1
+    # The guess, 1.5 m away, is more than 12 degrees off where the target is now.
+    guess = 1.5 * target / np.linalg.norm(target) - camera(ways[-1])
+    assert angle(guess, target - camera(ways[-1])) > 12
+    baseline = 0.25 * steps
+    # The guess pulls along the line of sight, by as much as its weight against the rays'.
+    share = 1e-3 / (math.sin(math.atan(baseline / target[2])) ** 2 / 2 + 1e-3)
+    close = 0.02 + share * float(np.linalg.norm(target) - 1.5)
+    off = 4 * sensed[-1, :3] - (target - camera(ways[-1]))
+    assert np.linalg.norm(off) < close < 0.5, (np.linalg.norm(off), close)
+    assert sensed[-1, 4] > 10 * sensed[0, 4]
+    del times
+
+
+@pytest.mark.parametrize("degrees", [0.0, 8.0])
+def test_who_stands_still_learns_nothing_new_however_long_it_looks(degrees: float) -> None:
+    first = Box(0.8, 0.3, 0.04)
+    rng = np.random.default_rng(6)
+    shift = math.tan(math.radians(degrees)) / 2 * rng.uniform(-0.5, 0.5, (300, 2))
+    boxes = np.tile(np.array(first, np.float32), (300, 1))
+    boxes[1:, :2] += shift[1:]
+
+    def step(known: triangulation.Sighting, box: jax.Array) -> tuple[Any, Any]:
+        known = triangulation.follow(known, jnp.zeros(2, jnp.int32))
+        known = triangulation.look(
+            known, jnp.int32(1), jnp.int32(1), box[None], jnp.ones(1, bool)
+        )
+        return known, triangulation.sense(known, jnp.int32(1))
+
+    _, sensed = jax.lax.scan(step, triangulation.begin(), jnp.asarray(boxes))
+    assert sensed.dtype == jnp.float32
+    place_and_certainty = np.asarray(sensed)[:, [0, 1, 2, 4]]
+    np.testing.assert_array_equal(place_and_certainty, place_and_certainty[:1].repeat(300, 0))
+    far = 4 * np.linalg.norm(place_and_certainty[-1, :3])
+    assert far == pytest.approx(1.5, abs=1e-3)
+    assert float(sensed[-1, 4]) == pytest.approx(1e-3 / (1e-3 + 0.03), rel=1e-2)
+    assert (np.ptp(np.asarray(sensed[:, 3])) > 0) == (degrees > 0)  # the radius is renewed
+
+
+def test_after_going_away_and_coming_back_rays_count_again() -> None:
+    about = 4 * [(ROTATE_RIGHT, False)]
+    away = [*about, *AHEAD, *about, *AHEAD]
+    here = [*about, *about, (MOVE_AHEAD, True), (LOOK_DOWN, False), (LOOK_UP, False)]
+    first, second = Box(0.5, 0.5, 0.01), Box(0.5 + math.tan(math.radians(8)) / 2, 0.5, 0.01)
+    for walk, expected in ((here, 0.0), (away, 4.0)):
+        frames = frames_of(
+            [[first], *([] for _ in walk[1:]), [second]], np.random.default_rng(0)
+        )
+        trails, sensed = walked(False, 0, *filled(walk), frames)
+        assert not np.asarray(trails.cell[len(walk)]).any()
+        right, _, ahead, *_ = np.asarray(sensed[len(walk)])
+        assert math.degrees(math.atan2(right, ahead)) == pytest.approx(expected, abs=0.1)
+    # Once it has counted, it counts no more.
+    assert not trails.sighting.moved[len(walk)]
 
 
 # On any walk
@@ -460,6 +613,19 @@ def test_a_trail_without_a_sighting_is_left_alone() -> None:
     trail = jax.eval_shape(odometry.begin, jnp.int32(0), jnp.int32(0))
     assert trail.sighting is jax.eval_shape(odometry.sense, trail).target is None
     assert odometry.look(trail, jnp.ones((2, 3)), jnp.ones(2, bool)) is trail
+    assert odometry.forget(trail, jnp.array(True)) is trail
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_lost_sighting_is_as_at_the_start_and_the_way_is_kept(lost: bool) -> None:
+    trail = odometry.begin(jnp.int32(1), jnp.int32(0), triangulates=True)
+    trail = odometry.follow(trail, jnp.int32(MOVE_AHEAD), jnp.array(False))
+    trail = odometry.look(trail, jnp.array([[0.4, 0.6, 0.2]]), jnp.array([True]))
+    trail = odometry.follow(trail, jnp.int32(MOVE_AHEAD), jnp.array(False))
+    after = odometry.forget(trail, jnp.array(lost))
+    begun = triangulation.begin()
+    chex.assert_trees_all_equal(after, trail.replace(sighting=begun) if lost else trail)
+    chex.assert_trees_all_equal_dtypes(after.sighting, begun)
 
 
 def test_the_numbers_of_the_target_stand_behind_the_others() -> None:
