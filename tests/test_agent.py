@@ -51,8 +51,8 @@ def sighting_agent(glove):
 
 @pytest.fixture(scope="module")
 def merging_agent(glove):
-    """The same, of a model that is shown one box for all objects of a class."""
-    network = NetworkConfig(odometry=True, triangulation=True, rows="class")
+    """One that senses its way, of a model that is shown one box for all objects of a class."""
+    network = NetworkConfig(odometry=True, rows="class")
     return going_by_odometry(glove, network)
 
 
@@ -143,6 +143,33 @@ def test_what_an_agent_senses_of_its_target_matters(sensing_agent, sighting_agen
     )
     assert np.abs(moved - forgot).max() > 1e-3
     assert np.abs(moved - blocked).max() > 1e-3
+
+
+def test_of_another_target_an_agent_has_never_seen_anything(sighting_agent):
+    mug, sink = Detection("mug", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.6, 0.1, 0.8, 0.4)
+    memory, _ = sighting_agent.act(sighting_agent.start(), [mug, sink], "mug")
+    memory = memory._replace(action=jnp.int32(Action.MOVE_AHEAD))
+    assert memory.trail.sighting.normal.any()
+    never = memory._replace(trail=memory.trail.replace(sighting=triangulation.begin()))
+
+    def after(memory, seen, target):
+        return sighting_agent.act(memory, seen, target, blocked=False)
+
+    for seen, target in (([], "sink"), ([mug, sink], "sink"), ([mug], "toaster")):
+        (kept, one), (fresh, other) = (after(m, seen, target) for m in (memory, never))
+        np.testing.assert_array_equal(one.probabilities, other.probabilities)
+        assert one.value == other.value
+        for mine, theirs in zip(
+            jax.tree.leaves(kept.trail), jax.tree.leaves(fresh.trail), strict=True
+        ):
+            np.testing.assert_array_equal(mine, theirs)
+        # It remembers its way all the same, and nothing of the mug when it looks for that again.
+        assert tuple(kept.trail.cell) == (0, 1)
+        back, _ = after(kept._replace(action=jnp.int32(Action.LOOK_UP)), [], "mug")
+        assert not back.trail.sighting.normal.any()
+    # A new label on the way is no other target.
+    same, _ = after(memory, [Detection("vase", 0.6, 0.1, 0.8, 0.4)], "mug")
+    assert same.trail.sighting.normal.any()
 
 
 def test_what_an_agent_senses_of_its_way_matters(sensing_agent):

@@ -38,13 +38,32 @@ def test_paper_preset_has_the_reference_constants():
         (TrainConfig(learner=LearnerConfig(learning_rate=float("nan"))), "--learning-rate nan"),
         (TrainConfig(network=NetworkConfig(odometry=1)), "--odometry 1"),
         (TrainConfig(network=NetworkConfig(odometry=True, triangulation=1)), "--triangulation 1"),
-        (TrainConfig(network=NetworkConfig(triangulation=True)), "--triangulation: needs --odom"),
+        (
+            TrainConfig(network=NetworkConfig(triangulation=True)),
+            "--triangulation: needs --odometry (or use --no-triangulation)",
+        ),
+        (
+            TrainConfig(network=NetworkConfig(odometry=True, triangulation=True, rows="class")),
+            "--rows class: --triangulation needs",
+        ),
+        (TrainConfig(learner=LearnerConfig(size_noise=-0.1)), "--size-noise -0.1: must be between"),
+        (TrainConfig(learner=LearnerConfig(size_noise=2.1)), "--size-noise 2.1: must be between"),
+        (TrainConfig(learner=LearnerConfig(size_noise=float("nan"))), "--size-noise nan"),
     ],
 )
 def test_a_value_out_of_range_is_named_in_one_line(config, flag):
     with pytest.raises(ValueError, match=re.escape(flag)) as caught:
         config.check()
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5, 2.0])
+def test_size_noise_may_be_as_much_as_two(noise):
+    TrainConfig(learner=LearnerConfig(size_noise=noise)).check()
+
+
+def test_one_row_per_class_is_fine_without_triangulation():
+    TrainConfig(network=NetworkConfig(odometry=True, rows="class")).check()
 
 
 def test_every_default_is_in_range():

@@ -86,7 +86,7 @@ FAULTS = (
           "state = state.replace(trail=_look(trail, state, params))",
           "state = state.replace(trail=trail)", "test_triangulation.py"),
     Fault("everything looks larger", ENV, "jnp.where(is_target, state.area_factor, 1.0)",
-          "state.area_factor",          "test_size_noise.py"),
+          "state.area_factor", "test_size_noise.py"),
     Fault("a box larger than the image", ENV,
           "jnp.minimum(boxes[:, 2] * jnp.where(is_target, state.area_factor, 1.0), 1.0)",
           "boxes[:, 2] * jnp.where(is_target, state.area_factor, 1.0)", "test_size_noise.py"),

@@ -12,10 +12,10 @@ import pytest
 
 from tdanet_jax import env
 from tdanet_jax.classes import Classes
-from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.config import MODELS, LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.scenes.offline import importer
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.task import make_task, resolve, without_effect
+from tdanet_jax.task import make_model, make_task, resolve, without_effect
 from tdanet_jax.words import WordVectors
 
 SMALL = NetworkConfig(width=8, hidden=4, precision="float32")
@@ -105,6 +105,24 @@ def test_odometry_and_triangulation_reach_the_network_and_both_environments(
             assert (state.trail.sighting is not None) == sights
 
 
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_that_is_not_shown_every_object_cannot_triangulate(name: str) -> None:
+    """In one line that says what to do instead."""
+    network = dataclasses.replace(SMALL, image="raster", odometry=True, triangulation=True)
+    config, classes = TrainConfig(model=name, network=network), Classes(("Mug", "Sink"), (0, 1))
+    if name.startswith("tdanet"):
+        assert make_model(config, classes).triangulation
+        return
+    message = (
+        f"^--triangulation: {name} is not shown a box of every object; use --no-triangulation$"
+    )
+    with pytest.raises(ValueError, match=message):
+        make_model(config, classes)
+    alone = dataclasses.replace(network, triangulation=False)
+    model = make_model(dataclasses.replace(config, network=alone), classes)
+    assert (model.odometry, model.triangulation) == (True, False)
+
+
 def test_auto_takes_the_feature_maps_that_lie_beside_the_data(tmp_path) -> None:
     data = tmp_path / "mine.npz"
     config = TrainConfig(model="baseline", network=SMALL, data=str(data))
@@ -145,3 +163,12 @@ def test_feature_maps_need_imported_rooms() -> None:
 def test_flags_that_change_nothing_are_named(model, network, idle) -> None:
     config = TrainConfig(model=model, network=network)
     assert sorted(without_effect(config, Classes())) == sorted(idle)
+
+
+@pytest.mark.parametrize("model", ["tdanet", "ssnet", "baseline"])
+def test_size_noise_changes_nothing_for_a_model_of_images(model: str) -> None:
+    network = NetworkConfig(image="raster") if model == "baseline" else NetworkConfig()
+    for noise in (0.0, 0.5):
+        config = TrainConfig(model=model, network=network, learner=LearnerConfig(size_noise=noise))
+        idle = ["--size-noise"] if noise and model == "baseline" else []
+        assert without_effect(config, Classes()) == idle

@@ -63,10 +63,10 @@ def test_decisions_of_any_model_are_timed(ithor, tmp_path):
         "decision",
         "--models",
         "ssnet",
+        "tdanet",
         "--repeats",
         "1",
         "--odometry",
-        "--triangulation",
         "--out",
     ]
     benchmark.main([*arguments, str(out)])

@@ -52,7 +52,7 @@ def inputs(senses: bool = False) -> tuple[Any, ...]:
     keep = jnp.asarray(rng.random((T, B, DROPOUT_UNITS)) < 0.75)
     obs = samples.observations(T, B)
     if senses:
-        obs = obs.replace(odometry=samples.odometry(T, B, sights=True))
+        obs = obs.replace(odometry=samples.odometry(T, B))
     return obs, jnp.asarray(previous, jnp.float32), jnp.asarray(FRESH), keep
 
 
@@ -161,9 +161,9 @@ def slow_rollout(params: Any, given: Any, first_order: bool = False, **network: 
 NOT_ADAPTED = ("way",)
 
 
-@pytest.mark.parametrize("senses", [False, True], ids=["plain", "triangulation"])
+@pytest.mark.parametrize("senses", [False, True], ids=["plain", "odometry"])
 def test_values_are_those_of_plain_per_environment_parameters(senses: bool) -> None:
-    model, plain = (m.clone(odometry=senses, triangulation=senses) for m in (MODEL, PLAIN))
+    model, plain = (m.clone(odometry=senses) for m in (MODEL, PLAIN))
     params = parameters(model)
     given = jax.tree.map(lambda x: x[:3], inputs(senses))  # a stretch, and one step behind it
     _, out = play(model, params, start(params, model=model), given)

@@ -117,8 +117,8 @@ def test_no_array_of_a_model_is_empty(name: str) -> None:
         assert leaf.size, jax.tree_util.keystr(path)
 
 
-def sensing(config: TrainConfig, sights: bool = True) -> TrainConfig:
-    """The same for an agent that senses its way, and where its target is."""
+def sensing(config: TrainConfig, sights: bool) -> TrainConfig:
+    """The same for an agent that senses its way, and maybe where its target is."""
     network = dataclasses.replace(config.network, odometry=True, triangulation=sights)
     return dataclasses.replace(config, network=network)
 
@@ -138,6 +138,12 @@ def test_every_named_model_is_made_and_answers(name: str) -> None:
     out = jax.jit(answer)(jax.random.key(0))
     assert out.logits.shape == (B, 6)
     assert np.isfinite(out.logits).all()
+
+
+def test_who_does_not_sense_its_way_cannot_sense_where_its_target_is() -> None:
+    model = ActorCritic(Plain(), hidden=6, triangulation=True)
+    with pytest.raises(ValueError, match="senses its target's place senses its way, too"):
+        jax.eval_shape(model.initialise, jax.random.key(0), WORDS)
 
 
 @pytest.mark.parametrize("sights", [False, True], ids=["odometry", "triangulation"])
@@ -160,8 +166,15 @@ def test_the_odometry_stands_behind_the_encoders_features_and_leaves_them_alone(
     np.testing.assert_allclose(features[..., alone.shape[-1] :], expected, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("sights", [False, True], ids=["odometry", "triangulation"])
-@pytest.mark.parametrize("name", MODELS)
+def can_triangulate(name: str) -> bool:
+    """Whether a named model is shown a box of every object."""
+    return name.startswith("tdanet")
+
+
+@pytest.mark.parametrize(
+    ("name", "sights"),
+    [(name, sights) for name in MODELS for sights in {False, can_triangulate(name)}],
+)
 def test_every_named_model_takes_odometry(name: str, sights: bool) -> None:
     names = tuple(f"Class{i}" for i in range(samples.CLASSES))
     config = sensing(dataclasses.replace(SMALL, model=name), sights)
@@ -188,7 +201,9 @@ def test_every_named_model_learns_with_odometry(
     name: str, some_rooms: SceneTables, glove: WordVectors
 ) -> None:
     learning = LearnerConfig(num_envs=4, rollout_steps=7, step_limit=5)  # an inner step, and resets
-    config = sensing(dataclasses.replace(SMALL, model=name, learner=learning))
+    config = sensing(
+        dataclasses.replace(SMALL, model=name, learner=learning), can_triangulate(name)
+    )
     task = make_task(config, some_rooms, glove)
     state = learner.init(
         jax.random.key(0), learning, task.model, task.train_words, task.train_params
@@ -210,6 +225,12 @@ def test_a_module_of_the_users_own_is_a_model(monkeypatch: pytest.MonkeyPatch) -
     config = dataclasses.replace(SMALL, model="my_lab.counts")
     config.check()
     assert isinstance(make_model(config, Classes()).encoder, Counts)
+    model = make_model(sensing(config, sights=True), Classes())
+    assert model.odometry
+    assert model.triangulation
+    # What it senses of its own accord, it senses without a flag, too.
+    module.make = lambda config, classes, dtype: ActorCritic(Counts(), odometry=True)
+    assert make_model(config, Classes()).odometry
 
 
 @pytest.mark.parametrize(
