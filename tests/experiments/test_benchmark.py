@@ -56,24 +56,27 @@ def test_a_model_that_multiplies_in_float32_alone_is_measured_once(ithor, tmp_pa
     assert [(row["model"], row["precision"]) for row in rows] == [("savn", "float32")]
 
 
-def test_decisions_of_any_model_are_timed(ithor, tmp_path):
+@pytest.mark.parametrize(
+    ("model", "flags"), [("ssnet", ["--odometry"]), ("tdanet", ["--odometry", "--triangulation"])]
+)
+def test_decisions_of_any_model_are_timed(model, flags, ithor, tmp_path):
     out = tmp_path / "figures.jsonl"
-    arguments = [
-        "--parts",
-        "decision",
-        "--models",
-        "ssnet",
-        "tdanet",
-        "--repeats",
-        "1",
-        "--odometry",
-        "--out",
-    ]
-    benchmark.main([*arguments, str(out)])
+    arguments = ["--parts", "decision", "--models", model, "--repeats", "1", *flags]
+    benchmark.main([*arguments, "--out", str(out)])
     rows = [json.loads(line) for line in out.read_text().splitlines()][1:]
-    assert [(row["model"], row["batch"]) for row in rows] == [("ssnet", 1), ("ssnet", 1024)]
-    assert all(row["odometry"] and row["triangulation"] for row in rows)
-    assert all(row["milliseconds"] > 0 and row["parameters"] > 2e6 for row in rows)
+    assert {(row["model"], row["batch"]) for row in rows} == {(model, 1), (model, 1024)}
+    assert all(row["odometry"] for row in rows)
+    assert {row["triangulation"] for row in rows} == {"--triangulation" in flags}
+    least = {"ssnet": 2e6, "tdanet": 1e6}[model]
+    assert all(row["milliseconds"] > 0 and row["parameters"] > least for row in rows)
+
+
+def test_a_model_that_cannot_triangulate_is_one_line(ithor, tmp_path, capsys):
+    flags = ["--models", "ssnet", "--odometry", "--triangulation"]
+    with pytest.raises(SystemExit) as ended:
+        benchmark.main(["--parts", "decision", *flags, "--out", str(tmp_path / "figures.jsonl")])
+    assert ended.value.code == 2
+    assert "--triangulation: ssnet is not shown a box" in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.parametrize("senses", [(False, False), (True, False), (True, True)])
