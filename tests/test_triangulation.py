@@ -119,15 +119,14 @@ class SlowSighting:
         tied = away if len(away) > 1 and gap < 2 * off else away[:1]
         after = [self.following(way, box) for box in tied]
         borders = [12 + known.degrees_off(way) for known in after]
-        if any(b - 12 > 180 for b in [12 + off, *borders]):
-            return True  # it stands in the target
         ends = [known.degrees(way, box) for known, box in zip(after, tied, strict=True)]
         if len(tied) > 1:
             return any(end < border for end, border in zip(ends, borders, strict=True))
         return abs(ends[0] - 12) < borders[0] - 12
 
     def degrees_off(self, way: SlowTrail) -> float:
-        """By how much float32 may miss the direction of the place, and some more."""
+        """By how much float32 may miss the direction of the place, and some more; in it, it may
+        be anywhere."""
         distance = float(np.linalg.norm(self.seen_from(way)))
         return math.inf if distance < 0.2 else 1 + math.degrees(self.rounding(way)) / distance
 
