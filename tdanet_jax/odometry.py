@@ -177,7 +177,7 @@ def sense(trail: Trail) -> Odometry:
 
 
 def numbers(sensed: Odometry) -> jax.Array:
-    """All of it as float32, [..., NUMBERS], from leading axes [...]."""
+    """All of it as float32, [..., NUMBERS] from leading axes [...], and behind it the target's."""
     bits = sensed.window[..., None] >> jnp.arange(ROTATIONS + 1, dtype=jnp.uint16) & 1
     flat = bits.reshape(*bits.shape[:-3], -1)
     target = [] if sensed.target is None else [sensed.target]
