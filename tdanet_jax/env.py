@@ -347,6 +347,7 @@ def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome
     -0.01 by default; a partial reward instead where `_partial_reward` gives one; R_t, or R_t and
     the partial reward for what is in view, for a `Done` with the target visible.
     """
+    action = jnp.asarray(action)  # of a Python int, `done` would be a Python bool
     pose = move(params, state.pose, action)
     done = action == Action.DONE
     success = done & is_visible(params, pose, params.target_class[state.target])

@@ -20,7 +20,7 @@ from tdanet_jax.env import EnvParams, EnvState, Observation
 from tdanet_jax.reward import Parents, cosines, greatest_similarity, no_parents
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.scenes.tables import build
-from tdanet_jax.vocabulary import TARGETS
+from tdanet_jax.vocabulary import TARGETS, Action
 from tests import handmade, oracle, toy
 from tests.handmade import Room, Sighting, corridor, lopsided, random_tables, tables_of
 from tests.oracle import DONE, ROOMS, Detection, Episode, World, pose_of, state_of
@@ -412,6 +412,20 @@ def test_jit_equals_eager_and_vmap_equals_a_loop(contract: tuple) -> None:
         if b < 4:
             chex.assert_trees_all_equal(env.step(*own, params), row)
             chex.assert_trees_all_equal(env.reset(own[0], params), nth(reset(keys, params), b))
+
+
+@pytest.mark.parametrize("action", [1, Action.ROTATE_LEFT, DONE, Action.DONE])
+def test_a_plain_number_is_an_action_too(action: int) -> None:
+    params, state = params_of(two_mugs()), at(handmade.state(0, 0))
+    for take in (env.transition, jax.jit(env.transition)):
+        out = take(state, action, params)
+        expected = env.transition(state, jnp.int32(action), params)
+        chex.assert_trees_all_equal_dtypes(out, expected)
+        chex.assert_trees_all_equal(out, expected)
+    _, _, _, terminated, truncated, _ = env.step(jax.random.key(0), state, action, params)
+    assert terminated.dtype == truncated.dtype == bool
+    assert bool(terminated) == (action == DONE)
+    assert not bool(truncated)
 
 
 def test_one_trace_per_shape_whatever_the_tables_hold(some_rooms: SceneTables) -> None:
