@@ -74,14 +74,15 @@ class Evaluated:
 
     def results(self) -> dict:
         """The content of a `results.json`, after the run's folder and where the run was; the run's
-        settings behind it."""
+        settings behind it. `point` and `share` are None where it is no point of a history."""
+        point = None if self.saved.point is None else self.snapshot.point
         groups = {
             name: report.columns(self.task.tables, *pair) for name, pair in self.played.items()
         }
         return {
             "run": str(self.saved.run),
-            "point": self.snapshot.point,
-            "share": self.snapshot.point / max(self.saved.config.history, 1),
+            "point": point,
+            "share": None if point is None else point / max(self.saved.config.history, 1),
             "updates": self.snapshot.updates,
             "training_seconds": round(self.snapshot.seconds, 1),
             **report.results(self.provenance, groups),

@@ -141,6 +141,15 @@ def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch, capsys):
     assert len((out / "episodes.jsonl").read_text().splitlines()) == 1000
 
 
+@pytest.mark.parametrize(("point", "share"), [(None, None), (Path("history/00000040.npz"), 0.25)])
+def test_only_a_point_of_a_history_has_a_share_of_the_budget(tmp_path, point, share):
+    snapshot = Snapshot(None, 40, 100, 1.0, 0 if point is None else 5, "d")
+    provenance = report.Provenance("18/4", "tdanet", "sample", 100, 0, 0, 1600, "d")
+    done = saved.Evaluated(Saved(tmp_path, TINY, point), snapshot, None, provenance, {})
+    found = done.results()
+    assert (found["point"], found["share"]) == (None if point is None else 5, share)
+
+
 def test_runs_of_folders_that_are_called_alike_have_their_paths_for_names():
     a, b, other = Path("x/run"), Path("y/run"), Path("x/other")
     assert evaluate.short_names([a, b, other]) == {a: "x/run", b: "y/run", other: "other"}
