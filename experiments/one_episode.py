@@ -31,7 +31,7 @@ class Choice:
     """Target class, say Laptop; with --scene."""
     start: tuple[float, float, int] | None = None
     """x and z in metres and rotation in degrees (a multiple of 45); the nearest reachable point is
-    taken. By default a start is drawn."""
+    taken, at most 0.5 m away. By default a start is drawn."""
     episode: int | None = None
     """Instead of a room and a target: an episode of the first checkpoint's episodes.jsonl, counted
     from 0, as it was recorded. Other checkpoints play it anew."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,9 +19,12 @@ from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
 
+#: How far from a start the nearest reachable point may be, in metres.
+FARTHEST_START = 0.5
+
 
 class Start(NamedTuple):
-    """Where an episode starts; the nearest reachable point is taken."""
+    """Where an episode starts; the nearest reachable point is taken, at most 0.5 m away."""
 
     x: float  # metres
     z: float  # metres
@@ -45,8 +49,8 @@ def find(
       seed: of the drawn start.
 
     Raises:
-      ValueError: no such room, target or heading, or the target is out of reach; the message says
-        what there is.
+      ValueError: no such room, target or heading, no reachable point near the start, or the target
+        is out of reach; the message says what there is.
     """
     if scene not in tables.scenes:
         raise ValueError(f"{scene}: no such room; there are {name_ranges(tables.scenes)}")
@@ -61,6 +65,13 @@ def find(
         room = ROOM_TYPES[tables.room_type[index]]
         return episodes.draw(tables, [scene], {room: [target]}, 1, seed)
     pose, goal = tables.nearest_state(index, *start), tables.targets.index(target)
+    x, _, z = tables.position[poses.split(pose).position]
+    away = math.hypot(x - start.x, z - start.z)
+    if not away <= FARTHEST_START:  # nor where it is no number
+        raise ValueError(
+            f"start at x {start.x:g}, z {start.z:g}: {away:.2f} m from the nearest place to stand "
+            f"in {scene}, x {x:g}, z {z:g}; at most {FARTHEST_START} m"
+        )
     if tables.distance[pose, goal] < 0:
         raise ValueError(f"{target}: out of reach from x {start.x:g}, z {start.z:g} in {scene}")
     return Episodes(np.array([pose], np.int32), np.array([goal], np.int32))

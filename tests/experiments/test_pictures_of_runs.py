@@ -50,6 +50,10 @@ def test_what_is_compiled_is_kept_for_the_next_start(monkeypatch, capsys, opinio
             "--checkpoint RUN --scene FloorPlan229 --target Painting --start 0 0 30",
             "rotation 30: not a multiple of 45",
         ),
+        (
+            "--checkpoint RUN --scene FloorPlan229 --target Painting --start 100 100 0",
+            "start at x 100, z 100: ",
+        ),
     ],
 )
 def test_wrong_arguments_give_one_line_and_write_nothing(
@@ -146,7 +150,8 @@ def test_a_model_that_sees_an_image_and_adapts_stands_beside_another(
     run, out = tmp_path / "savn", tmp_path / "both.html"
     network = dataclasses.replace(TINY.network, image="raster", inner_rate=50.0)
     save_untrained(dataclasses.replace(TINY, model="savn", network=network), run, some_rooms, glove)
-    chosen = ["--scene", "FloorPlan229", "--target", "Painting", "--start", "0", "0", "90"]
+    chosen = ["--scene", "FloorPlan229", "--target", "Painting"]
+    chosen += ["--start", "-1.25", "0.5", "90"]
     both = ["--checkpoint", str(run), "--checkpoint", str(opinionated_run), "--policy", "greedy"]
     replay.main([*both, *chosen, "--data", str(rooms_file), "--out", str(out)])
     text = re.search(r'type="application/json">(.*?)</script>', out.read_text(), re.S).group(1)
