@@ -34,7 +34,13 @@ from experiments.console import (
 )
 from tdanet_jax import files
 from tdanet_jax.scenes.scene import GRID
-from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TRAIN_SCENES_PER_TYPE, make_split
+from tdanet_jax.vocabulary import (
+    ALL_TARGETS,
+    ROOM_TYPES,
+    TARGETS,
+    TRAIN_SCENES_PER_TYPE,
+    make_split,
+)
 
 if TYPE_CHECKING:
     from tdanet_jax.scenes import SceneTables, dataset
@@ -342,11 +348,32 @@ def print_needs(rooms: dataset.Rooms) -> None:
             'iTHOR\'s rooms, or by "split": "train" or "test" in the scene file',
             stacklevel=2,
         )
+    uses = {"train in": train, "be evaluated in": test}
+    empty = [use for use, names in uses.items() if names and not _hold_target(tables, names)]
+    if empty:
+        kinds = [room for i, room in enumerate(ROOM_TYPES) if i in tables.room_type]
+        listed = "; ".join(f"in a {kind}, {', '.join(TARGETS[kind])}" for kind in kinds)
+        warnings.warn(
+            f"no room to {' or to '.join(empty)} holds a target that can be found there, and a run "
+            f"needs one: {listed}",
+            stacklevel=2,
+        )
     if not (tables.row_box >= 0).any():
         console.print("No boxes in any room: an agent that sees detections will see nothing.")
     lacking = words.load_bundled().missing(tables.classes)
     if lacking:
         console.print(f"Needs --word-vectors: no bundled ones for {', '.join(lacking)}")
+
+
+def _hold_target(tables: SceneTables, rooms: Sequence[str]) -> bool:
+    """Whether an episode can begin in any of these rooms."""
+    reachable = tables.reachable
+    for room in map(tables.scenes.index, rooms):
+        targets = TARGETS[ROOM_TYPES[tables.room_type[room]]]
+        goals = [tables.targets.index(name) for name in targets if name in tables.targets]
+        if reachable[tables.position_scene == room][:, goals].any():
+            return True
+    return False
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,9 +1,11 @@
 """The command: what it writes, and one clear line where it cannot."""
 
+import copy
 import importlib
 import json
 import shlex
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -58,7 +60,10 @@ def test_rooms_that_no_split_uses_and_words_without_vectors_are_said(
     scene_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     named = {**DOCUMENT, "name": "FloorPlan5"}
-    named["objects"] = [{**DOCUMENT["objects"][0], "objectType": "MugXqzzy"}]
+    named["objects"] = [
+        {**DOCUMENT["objects"][0], "objectId": name, "objectType": name}
+        for name in ("MugXqzzy", "Pillow")
+    ]
     scene_file.write_text(json.dumps([DOCUMENT, named]))
     scenes.main(["import", str(scene_file), "--out", str(scene_file.with_name("lab.npz"))])
     said = capsys.readouterr()
@@ -66,6 +71,38 @@ def test_rooms_that_no_split_uses_and_words_without_vectors_are_said(
     assert len(said.err.splitlines()) == 1
     assert "Rooms to train in: 1; to be evaluated in: 0" in said.out
     assert "Needs --word-vectors: no bundled ones for MugXqzzy (xqzzy)" in said.out
+
+
+@pytest.mark.parametrize(
+    ("change", "useless"),
+    [
+        ({"objectType": "Stool"}, "train in or to be evaluated in"),
+        ({"objectType": "Toaster"}, "train in or to be evaluated in"),  # not in a bedroom
+        ({"objectType": "Pillow"}, ""),
+        ({"objectType": "Pillow", "far": 9.0}, "be evaluated in"),
+    ],
+)
+def test_rooms_that_hold_no_target_are_said(
+    scene_file: Path, capsys: pytest.CaptureFixture[str], change: dict[str, Any], useless: str
+) -> None:
+    """Training would fail in them."""
+    thing = {**DOCUMENT["objects"][0], "objectType": change["objectType"]}
+    far = copy.deepcopy(thing)
+    far["axisAlignedBoundingBox"]["center"]["z"] += change.get("far", 0.0)
+    rooms = [
+        {**DOCUMENT, "split": "train", "objects": [thing]},
+        {**DOCUMENT, "name": "Attic", "split": "test", "objects": [far]},
+    ]
+    scene_file.write_text(json.dumps(rooms))
+    scenes.main(["import", str(scene_file), "--out", str(scene_file.with_name("lab.npz"))])
+    said = capsys.readouterr().err.splitlines()
+    if useless:
+        assert said == [
+            f"warning: no room to {useless} holds a target that can be found there, and a run "
+            "needs one: in a bedroom, Blinds, DeskLamp, Pillow, AlarmClock, CD"
+        ]
+    else:
+        assert said == []
 
 
 def test_more_classes_than_can_be_numbered(
