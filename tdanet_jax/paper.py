@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 WORLDS_DIFFER = (
     "The worlds differ: the paper used AI2-THOR 1.0.1 and its own test episodes; these rooms are "
-    "rebuilt from the metadata of a later version and have longer episodes on average."
+    "rebuilt from the metadata of a later version."
 )
 
 

@@ -159,9 +159,13 @@ def write(
     tables: SceneTables,
     played: Mapping[str, tuple[Episodes, Records]],
 ) -> dict:
-    """Writes `results.json`, `results.md` and `episodes.jsonl`; returns the results."""
+    """Writes `results.json`, `results.md` and `episodes.jsonl`; returns the results.
+
+    The folder is made if need be.
+    """
     groups = {name: columns(tables, *pair) for name, pair in played.items()}
     out = results(provenance, groups)
+    folder.mkdir(parents=True, exist_ok=True)
     write_rows(folder, all_rows(tables, played))
     files.write_text(folder / RESULTS_PAGE, markdown(out, groups))
     # The last file, and whole: where it is, the others are.

@@ -84,6 +84,14 @@ def test_the_report_says_that_an_agent_senses_more_than_the_papers(played, ithor
     assert report.agent_name("tdanet", False, False) == "tdanet"
 
 
+def test_a_folder_that_is_not_there_is_made(played, ithor, tmp_path):
+    shown = report.Provenance("18/4", "tdanet", "sample", 10, 3, 7, 200, ithor.data_version)
+    report.write(tmp_path / "one" / "two", shown, ithor, played)
+    assert sorted(path.name for path in (tmp_path / "one" / "two").iterdir()) == [
+        "episodes.jsonl", "results.json", "results.md"
+    ]  # fmt: skip
+
+
 def test_percentages_run_from_0_to_100_and_an_empty_bucket_is_null(written):
     _, out = written
     assert out["seen"]["L>=1"]["SR"] == pytest.approx(100 / 3, abs=0.01)
