@@ -130,7 +130,7 @@ def default_folder(config: TrainConfig) -> Path:
 
 def train(config: TrainConfig, folder: Path, command: Command) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
-    with stoppable(lambda: how_to_go_on(folder)) as stop:
+    with stoppable(lambda: how_to_go_on(folder, config.model)) as stop:
         from tdanet_jax import devices, episodes, files
         from tdanet_jax.task import load_task, resolve, without_effect
         from tdanet_jax.training import Run
@@ -171,14 +171,19 @@ def prepare(folder: Path, config: TrainConfig, task: Task, resume: bool) -> None
     task.classes.save(folder)
 
 
-def how_to_go_on(folder: Path) -> str:
+def trust(model: str) -> str:
+    """The setting without which commands refuse a run's model; none for our own models."""
+    return "" if model in configs.MODELS else f"{configs.TRUST}={model}"
+
+
+def how_to_go_on(folder: Path, model: str) -> str:
     """What to say to someone who has stopped a run."""
     from tdanet_jax.checkpoint import Checkpoints
 
     if not (folder / CONFIG_FILE).exists():
         return "the run had not begun"
-    again = f"go on with: python -m experiments.train_zero_shot --resume {folder}"
-    return f"{Checkpoints(folder).latest() or 0:,} updates are saved; {again}"
+    again = f"{trust(model)} python -m experiments.train_zero_shot --resume {folder}".lstrip()
+    return f"{Checkpoints(folder).latest() or 0:,} updates are saved; go on with: {again}"
 
 
 def title(run: Run) -> str:
@@ -292,6 +297,8 @@ def report_on(run: Run, lists: Mapping[str, Episodes]) -> None:
     )
     print_summary(report.write(run.folder, provenance, task.tables, played))
     console.print(f"wrote {run.folder / 'results.md'}")
+    if setting := trust(run.config.model):
+        console.print(f"a model of your own: to evaluate or load it, export {setting}")
 
 
 if __name__ == "__main__":

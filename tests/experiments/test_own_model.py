@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import tdanet_jax
+from experiments import train_zero_shot
 from tdanet_jax.agent import Detection
 from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig, TrainConfig
@@ -28,6 +29,7 @@ def test_the_example_on_the_page_is_a_model(
     small = ("--steps", "400", "--history", "0", *command.TINY)
     done = command.run("train_zero_shot", *given, *small, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert "TDANET_TRUST=my_lab.most_alike" in done.stdout.splitlines()[-1]
     out = tmp_path / given[given.index("--out") + 1]
     results = json.loads((out / "results.json").read_text())
     assert results["unseen"]["L>=1"]["n"] == 1000
@@ -41,6 +43,14 @@ def test_the_example_on_the_page_is_a_model(
     assert sum(decision.probabilities) == pytest.approx(1, abs=1e-5)
     _, other = agent.act(agent.start(), seen[:1], target="toaster")
     assert other.value != decision.value
+
+
+def test_who_stops_a_run_of_a_model_of_ones_own_learns_how_to_trust_it(tmp_path):
+    (tmp_path / "config.json").touch()
+    again = f"python -m experiments.train_zero_shot --resume {tmp_path}"
+    said = train_zero_shot.how_to_go_on(tmp_path, "my_lab.most_alike")
+    assert said.endswith(f"go on with: TDANET_TRUST=my_lab.most_alike {again}")
+    assert train_zero_shot.how_to_go_on(tmp_path, "savn").endswith(f"go on with: {again}")
 
 
 def test_a_module_that_makes_no_model_is_refused(tmp_path, monkeypatch):
