@@ -192,6 +192,22 @@ def test_it_fits_a_phone_in_light_and_dark_and_names_do_not_cover_each_other(
     assert len(backs) == 2
 
 
+@pytest.mark.parametrize(("width", "height"), [(1400, 900), (1920, 1080)])
+@pytest.mark.parametrize("players", [1, 2, 3])
+def test_actions_and_their_probabilities_stay_above_the_bar(
+    visit, traces, some_rooms, players, width, height
+):
+    shown = [traces[0], *traces][:players]
+    page = visit(replay.page(shown, some_rooms), viewport={"width": width, "height": height})
+    assert page.locator(".player").count() == players
+    bar = page.locator("nav").bounding_box()["y"]
+    for row in page.locator("tr:has(.bar)").all():
+        box = row.bounding_box()
+        assert box["y"] + box["height"] <= bar
+    pictures = page.locator("svg.plan, svg.view").all()
+    assert min(picture.bounding_box()["height"] for picture in pictures) > 150
+
+
 def test_everything_has_a_name_to_be_read_out(visit, traces, some_rooms):
     page = visit(replay.page(traces, some_rooms))
     nameless = page.evaluate(
