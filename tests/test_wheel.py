@@ -37,6 +37,10 @@ def test_it_holds_every_file_of_the_packages(unpacked):
                 assert (unpacked / path.relative_to(ROOT)).read_bytes() == path.read_bytes()
 
 
+def test_type_checkers_are_told_that_it_is_typed(unpacked):
+    assert (unpacked / "tdanet_jax" / "py.typed").is_file()
+
+
 def test_it_finds_what_it_reads_from_any_folder(unpacked, tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", READ], cwd=tmp_path, capture_output=True, text=True,
