@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import jax
+import numpy as np
 import pytest
 
 from experiments import evaluate
@@ -18,7 +19,9 @@ from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.history import Snapshot
 from tdanet_jax.saved import Saved
 from tdanet_jax.task import make_task
+from tdanet_jax.vocabulary import Action
 from tests.experiments import command
+from tests.experiments.pages import block
 from tests.experiments.test_faults import full_disk
 from tests.models import samples
 from tests.test_agent import OLD_RUN
@@ -139,6 +142,18 @@ def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch, capsys):
     evaluate.evaluate_several(command, [Done.saved], out)
     assert json.loads((out / "evaluations.json").read_text()) == [made_up()]
     assert len((out / "episodes.jsonl").read_text().splitlines()) == 1000
+
+
+def test_a_policy_of_ones_own_as_the_page_shows_it(ithor, few_episodes, capsys):
+    there = {}
+    exec(block("evaluation.md", "own_policy.py"), there)
+    lines = capsys.readouterr().out.splitlines()
+    for line, (group, (_, records)) in zip(lines, there["played"].items(), strict=True):
+        assert line.startswith(f"{group} {{'SR': {100 * records.success.mean():.1f}, ")
+        assert 0.1 < records.success.mean() < 0.5
+        last = records.actions[np.arange(100), records.length - 1]
+        assert (last[records.success] == Action.DONE).all()
+    assert list(there["played"]) == ["seen", "unseen"]
 
 
 @pytest.mark.parametrize(("point", "share"), [(None, None), (Path("history/00000040.npz"), 0.25)])
