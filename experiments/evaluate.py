@@ -48,8 +48,8 @@ class Command:
     """sample and greedy: how the network's actions are chosen. random and shortest_path need no
     checkpoint; the latter knows the way."""
     split: str | None = None
-    """Split of the policies that need no checkpoint; by default 18/4. A run is evaluated on its
-    own."""
+    """Split of the policies that need no checkpoint, as of the training command; by default 18/4. A
+    run is evaluated on its own."""
     validation: bool = False
     """Their episodes are those that `--validation` of the training command leaves for choices."""
     data: str | None = None
@@ -114,7 +114,7 @@ def default_folder(command: Command) -> Path:
 def untrained_config(command: Command) -> TrainConfig:
     """The task and seed of the policies that need no checkpoint."""
     return TrainConfig(
-        split=command.split or TrainConfig().split,
+        split=TrainConfig().split if command.split is None else command.split,
         validation=command.validation,
         data=command.data,
         word_vectors=command.word_vectors,

@@ -34,9 +34,10 @@ from experiments.console import (
 )
 from experiments.train_zero_shot import figures_of, parse_command, prepare, report_on, title, train
 from tdanet_jax import sweep, sweep_report
-from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
 from tdanet_jax.sweep import Finished
 from tdanet_jax.sweep_report import Cost
+from tdanet_jax.vocabulary import file_name
 
 if TYPE_CHECKING:
     from tdanet_jax.training import Run
@@ -64,7 +65,7 @@ class Command:
     out: Path
     """Folder of the sweep: a folder for each run, and the report."""
     splits: tuple[str, ...] = ("18/4",)
-    """Splits to train on."""
+    """Splits to train on: 22/0, 18/4, 14/8, or unseen classes with commas (Mug,Vase,CD,Towel)."""
     models: tuple[str, ...] = ("tdanet",)
     """Models to train, ablations included; see --model of train_zero_shot."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -92,7 +93,7 @@ def main(arguments: list[str] | None = None) -> None:
             if word.partition("=")[0] in OWN:
                 fail(f"{word}: a sweep takes {OWN[word.partition('=')[0]]}")
         training = parse_command(rest)
-        base = training.run.with_absolute_paths()
+        base = training.run.normalised()
         configs = sweep.plan(base, command.splits, command.models, command.seeds)
         if command.vmap_seeds and (base.episodes is not None or base.minutes is not None):
             fail("--vmap-seeds needs a budget in --steps: seeds that end apart cannot share a call")
@@ -102,7 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
             fail("a sweep is one process; JAX_COORDINATOR_ADDRESS is set")
         check_positive(devices=training.devices)
         included = [sweep.finished(folder) for folder in command.include]
-        planned = [] if command.report_only else [command.out / sweep.run_name(c) for c in configs]
+        planned = [] if command.report_only else [command.out / run_name(c) for c in configs]
         # What cannot stand in one report shows at once, not after hours of training.
         check_alike([*sweep.find(command.out), *included], planned)
         try:
@@ -132,7 +133,7 @@ def train_all(
     devices.connect(training.devices)
     devices.keep_compiled()
     configs = [resolve(config) for config in configs]
-    folders = [command.out / sweep.run_name(config) for config in configs]
+    folders = [command.out / run_name(config) for config in configs]
     # All are looked at before the first trains: a clash shows at once, not after hours, and so does
     # a model that cannot be made.
     for config in configs:
@@ -236,7 +237,7 @@ def write_report(out: Path, included: Sequence[Finished]) -> None:
             machine=measure.processor(),
             code=report.code_version(),
         )
-        names = {split: f"learning_curve-{split.replace('/', '-')}.png" for split in curves}
+        names = {split: f"learning_curve-{file_name(split)}.png" for split in curves}
         for split, name in names.items():
             figures.evaluated_curves(curves[split], f"Split {split}, test rooms", out / name)
         content = json.dumps(sweep_report.to_json(found), indent=2)

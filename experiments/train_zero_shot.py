@@ -36,7 +36,7 @@ from experiments.console import (
     stoppable,
 )
 from tdanet_jax import config as configs
-from tdanet_jax.config import CONFIG_FILE, PRESETS, TrainConfig
+from tdanet_jax.config import CONFIG_FILE, PRESETS, TrainConfig, run_name
 
 if TYPE_CHECKING:
     from tdanet_jax.episodes import Episodes
@@ -86,7 +86,7 @@ def main(arguments: list[str] | None = None) -> None:
         else:
             config = command.run
             config.check()
-            config = config.with_absolute_paths()
+            config = config.normalised()
             joined = bool(os.environ.get("JAX_COORDINATOR_ADDRESS"))
             if command.out is None and joined:
                 fail("a run of several processes needs --out: a folder that all of them see")
@@ -123,9 +123,7 @@ def check_new(folder: Path) -> None:
 
 def default_folder(config: TrainConfig) -> Path:
     """runs/18-4-tdanet-seed0-20260131-120000."""
-    split = config.split.replace("/", "-") + ("-validation" if config.validation else "")
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    return Path("runs") / f"{split}-{config.model}-seed{config.seed}-{stamp}"
+    return Path("runs") / f"{run_name(config)}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def train(config: TrainConfig, folder: Path, command: Command) -> None:

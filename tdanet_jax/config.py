@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tdanet_jax import files
-from tdanet_jax.vocabulary import UNSEEN
+from tdanet_jax.vocabulary import file_name, make_split, split_name
 
 #: Models by name: the module that makes each, and the settings that it is made with.
 MODELS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
@@ -122,7 +122,8 @@ class TrainConfig:
     """One training run."""
 
     split: str = "18/4"
-    """Seen/unseen target classes: 22/0, 18/4 or 14/8."""
+    """Seen/unseen target classes: 22/0, 18/4 or 14/8; or the unseen classes themselves, separated
+    by commas: Mug,Vase,CD,Towel."""
     model: str = "tdanet"
     """The model to train: tdanet, one of its ablations (tdanet-no-ta without target attention,
     tdanet-no-sa without the Siamese comparison, tdanet-no-ta-sa without either), ssnet, mjolnir-o,
@@ -170,8 +171,7 @@ class TrainConfig:
                     wanted = "finite" if isinstance(value, float) else f"of type {kind}"
                     raise ValueError(f"--{name.replace('_', '-')} {value}: must be {wanted}")
         check_seed(self.seed)
-        if self.split not in UNSEEN:
-            raise ValueError(f"--split {self.split}: choose one of {', '.join(UNSEEN)}")
+        make_split(self.split, self.validation)
         if self.model not in MODELS and "." not in self.model:
             known = ", ".join(MODELS)
             raise ValueError(f"--model {self.model}: choose one of {known}, or name a module")
@@ -223,14 +223,17 @@ class TrainConfig:
             if not 0 <= value <= 1 or (flag == "--dropout" and value == 1):
                 raise ValueError(f"{flag} {value}: must be a share between 0 and 1")
 
-    def with_absolute_paths(self) -> TrainConfig:
-        """The same run, its files named so that they are found from any folder."""
+    def normalised(self) -> TrainConfig:
+        """The same run, as it is kept: its split by its one name, its files by absolute paths."""
 
         def absolute(path: str | None) -> str | None:
             return None if path is None else str(Path(path).absolute())
 
         return dataclasses.replace(
-            self, data=absolute(self.data), word_vectors=absolute(self.word_vectors)
+            self,
+            split=split_name(self.split),
+            data=absolute(self.data),
+            word_vectors=absolute(self.word_vectors),
         )
 
     def with_budget(self, other: TrainConfig) -> TrainConfig:
@@ -249,6 +252,12 @@ class TrainConfig:
     def steps_per_update(self) -> int:
         """Environment steps in one update."""
         return self.learner.num_envs * self.learner.rollout_steps
+
+
+def run_name(config: TrainConfig) -> str:
+    """What a run's folder is called: 18-4-tdanet-seed0, Mug-Vase-tdanet-seed0."""
+    split = file_name(config.split) + ("-validation" if config.validation else "")
+    return f"{split}-{config.model}-seed{config.seed}"
 
 
 def check_seed(seed: int) -> None:

@@ -83,7 +83,7 @@ def draw_split(tables: SceneTables, split: Split) -> dict[str, Episodes]:
 
 
 def build_asset(tables: SceneTables, out_dir: Path) -> Path:
-    """Writes the lists of every split, and of its validation, for these tables."""
+    """Writes the lists of every published split, and of its validation, for these tables."""
     arrays = {"data_version": np.frombuffer(tables.data_version.encode(), np.uint8)}
     for name in UNSEEN:
         for validation in (False, True):
@@ -98,9 +98,10 @@ def build_asset(tables: SceneTables, out_dir: Path) -> Path:
 def load(tables: SceneTables, split: Split, extras: Extras | None = None) -> dict[str, Episodes]:
     """The lists of a split: group -> episodes.
 
-    Those of the bundled rooms are committed. Imported rooms have the published ones that came with
-    them; a group of which none can be solved, and all of rooms without any, are drawn, which gives
-    the same lists every time.
+    Those of the published splits in the bundled rooms are committed; those of other splits are
+    drawn in the same way. Imported rooms have the published ones that came with them; a group of
+    which none can be solved, and all of rooms without any, are drawn. What is drawn is the same
+    every time.
 
     Args:
       extras: what came with imported rooms; None with the bundled ones.
@@ -109,7 +110,7 @@ def load(tables: SceneTables, split: Split, extras: Extras | None = None) -> dic
       ValueError: the committed lists belong to other tables, or nothing can be evaluated.
     """
     if extras is None:
-        return _committed(tables, split)
+        return _committed(tables, split) or draw_split(tables, split)
     lists = draw_split(tables, split) | published(tables, split, extras.episodes)
     lists = {group: episodes for group, episodes in lists.items() if len(episodes)}
     if "seen" not in lists:
@@ -145,6 +146,7 @@ def published(
 
 
 def _committed(tables: SceneTables, split: Split) -> dict[str, Episodes]:
+    """The committed lists of a split, which are drawn from these tables; none of other splits."""
     with np.load(assets.path(ASSET), allow_pickle=False) as data:
         version = bytes(data["data_version"]).decode()
         if version != tables.data_version:

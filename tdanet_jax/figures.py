@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -47,7 +49,7 @@ def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> No
     right.legend(handles=[*right.get_lines(), *entropy.get_lines()], **place)
     for axis in (left, right):
         _episodes_along(axis)
-    figure.suptitle(title)
+    figure.suptitle(_in_lines(title))
     with files.replacing(path) as fresh:
         figure.savefig(fresh, dpi=130)
 
@@ -98,11 +100,16 @@ def evaluated_curves(curves: Sequence[Curve], title: str, path: Path) -> None:
                 _draw_curve(axis, curve, group, measure, *style)
         axis.set(ylabel=f"{measure}, per cent, test rooms", ylim=(0, None), xlim=(0, None))
         _episodes_along(axis)
-    figure.suptitle(title)
+    figure.suptitle(_in_lines(title))
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
     with files.replacing(path) as fresh:
         figure.savefig(fresh, dpi=130)
+
+
+def _in_lines(title: str) -> str:
+    """A title over two panels; the name of a split may be longer than they are wide."""
+    return textwrap.fill(re.sub(r",(?! )", ", ", title), 90)
 
 
 def _draw_curve(

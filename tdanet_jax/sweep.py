@@ -17,6 +17,7 @@ from tdanet_jax import comparison, files
 from tdanet_jax import config as configs
 from tdanet_jax.comparison import Result
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.vocabulary import split_name
 
 #: Where the evaluated histories of a sweep's runs are kept.
 HISTORIES = "histories"
@@ -30,6 +31,7 @@ def plan(
     Raises:
       ValueError: a value is not allowed or given twice; the message names the flag.
     """
+    splits = [split_name(split) for split in splits]
     for flag, given in (("--splits", splits), ("--models", models), ("--seeds", seeds)):
         if not given:
             raise ValueError(f"{flag}: give at least one")
@@ -44,12 +46,6 @@ def plan(
     for config in out:
         config.check()
     return out
-
-
-def run_name(config: TrainConfig) -> str:
-    """18-4-tdanet-seed0."""
-    split = config.split.replace("/", "-") + ("-validation" if config.validation else "")
-    return f"{split}-{config.model}-seed{config.seed}"
 
 
 def progress(folder: Path, config: TrainConfig) -> Literal["new", "begun", "finished"]:

@@ -196,7 +196,8 @@ def _comparison(report: Report, split: str) -> Iterator[str]:
     ]
     theirs = comparison.paper_rows(split)
     rows += [((f"{agent} (paper)", "", ""), groups) for agent, groups in theirs.items()]
-    yield from ("", f"## Split {split}: comparison of models (the paper's Tables I to III)", "")
+    tables = " (the paper's Tables I to III)" if split in PAPER_SPLITS else ""
+    yield from ("", f"## Split {split}: comparison of models{tables}", "")
     yield from comparison.table(("Model", "Seeds", "Training episodes"), rows)
     if theirs:
         worlds = dict.fromkeys(

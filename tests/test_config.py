@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -29,6 +30,11 @@ def test_paper_preset_has_the_reference_constants():
     ("config", "flag"),
     [
         (TrainConfig(split="17/5"), "--split 17/5"),
+        (TrainConfig(split="Mug,CD,Mug"), "--split Mug,CD,Mug: Mug is given twice"),
+        (
+            TrainConfig(split="Painting,Laptop,Television,RemoteControl,Vase", validation=True),
+            "leaves no class to train on in living_room beside the one that --validation holds out",
+        ),
         (TrainConfig(model="cnn"), "--model cnn"),
         (TrainConfig(steps=0), "--steps 0"),
         (TrainConfig(minutes=-1.0), "--minutes -1.0"),
@@ -60,6 +66,16 @@ def test_a_value_out_of_range_is_named_in_one_line(config, flag):
 @pytest.mark.parametrize("noise", [0.0, 0.5, 2.0])
 def test_size_noise_may_be_as_much_as_two(noise):
     TrainConfig(learner=LearnerConfig(size_noise=noise)).check()
+
+
+def test_a_run_is_kept_under_the_one_name_of_its_split_and_with_absolute_paths(tmp_path):
+    config = TrainConfig(split="vase, Mug", data=str(tmp_path / "rooms.npz"), word_vectors="a.txt")
+    config.check()
+    kept = config.normalised()
+    assert kept.split == "Mug,Vase"
+    assert (kept.data, kept.word_vectors) == (config.data, str(Path("a.txt").absolute()))
+    assert kept == kept.normalised() == configs.from_json(configs.to_json(kept))
+    assert TrainConfig(split="Pillow,Laptop,Toaster,ToiletPaper").normalised() == TrainConfig()
 
 
 def test_one_row_per_class_is_fine_without_triangulation():

@@ -131,3 +131,4 @@ def test_unseen_classes_with_a_near_synonym_are_reported_apart(ithor, tmp_path):
     page = (tmp_path / "results.md").read_text()
     assert "| unseen | ToiletPaper | 100.0 (100.0 to 100.0) |" in page
     assert "| unseen | without ToiletPaper | 0.0 (0.0 to 0.0) |" in page
+    assert "known in training (ToiletPaper: ToiletPaperHanger, PaperTowelRoll) apart" in page

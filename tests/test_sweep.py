@@ -18,7 +18,7 @@ BASE = TrainConfig(steps=1000)
 
 def test_a_plan_is_every_combination_seeds_together():
     plan = sweep.plan(BASE, ("18/4", "14/8"), ("tdanet", "tdanet-no-ta"), (3, 4))
-    assert [sweep.run_name(config) for config in plan] == [
+    assert [configs.run_name(config) for config in plan] == [
         "18-4-tdanet-seed3", "18-4-tdanet-seed4", "18-4-tdanet-no-ta-seed3",
         "18-4-tdanet-no-ta-seed4", "14-8-tdanet-seed3", "14-8-tdanet-seed4",
         "14-8-tdanet-no-ta-seed3", "14-8-tdanet-no-ta-seed4",
@@ -26,9 +26,18 @@ def test_a_plan_is_every_combination_seeds_together():
     assert all(config.steps == 1000 for config in plan)
 
 
+def test_a_split_of_ones_own_is_planned_under_its_one_name():
+    plan = sweep.plan(BASE, ("18/4", "towel,Mug"), ("tdanet",), (0,))
+    assert [config.split for config in plan] == ["18/4", "Mug,Towel"]
+    assert [configs.run_name(c) for c in plan] == ["18-4-tdanet-seed0", "Mug-Towel-tdanet-seed0"]
+    held_out = dataclasses.replace(plan[1], validation=True)
+    assert configs.run_name(held_out) == "Mug-Towel-validation-tdanet-seed0"
+
+
 @pytest.mark.parametrize(
     ("splits", "models", "seeds", "message"),
     [
+        (("Mug,CD", "cd,mug"), ("tdanet",), (0,), "--splits: a value is given twice"),
         ((), ("tdanet",), (0,), "--splits: give at least one"),
         (("18/4",), ("tdanet", "tdanet"), (0,), "--models: a value is given twice"),
         (("18/4",), ("tdanet",), (0, 0), "--seeds: a value is given twice"),
@@ -43,7 +52,7 @@ def test_a_wrong_plan_names_the_flag(splits, models, seeds, message):
 
 def made(out, config, results=None):
     """A run's folder with its configuration and, if given, results."""
-    folder = out / sweep.run_name(config)
+    folder = out / configs.run_name(config)
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps(configs.to_json(config)))
     if results is not None:
@@ -75,7 +84,7 @@ def test_only_finished_runs_are_found_and_damaged_results_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"results\.json: not the results of a run"):
         sweep.find(tmp_path)
     with pytest.raises(ValueError, match="the run is not finished"):
-        sweep.finished(tmp_path / sweep.run_name(BASE))
+        sweep.finished(tmp_path / configs.run_name(BASE))
 
 
 def keep_history(folder, weight=1.0, points=(1, 2)):

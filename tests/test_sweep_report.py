@@ -107,6 +107,17 @@ def test_the_json_holds_what_the_page_shows(report):
     assert out["left_out"] == sweep_report.left_out(report)
 
 
+def test_a_split_of_ones_own_stands_behind_those_of_the_paper(report, tmp_path):
+    config = dataclasses.replace(BASE, split="Mug,Vase")
+    run = sweep.finished(made(tmp_path / "own", config, result(split="Mug,Vase")))
+    both = dataclasses.replace(report, runs=[run, *report.runs])
+    assert both.splits == ["18/4", "Mug,Vase"]
+    page = sweep_report.markdown(both, {})
+    assert "## Split 18/4: comparison of models (the paper's Tables I to III)" in page
+    assert "## Split Mug,Vase: comparison of models\n" in page
+    assert "| Mug-Vase-tdanet-seed0 | 0 |" in page
+
+
 def test_a_report_on_one_model_has_no_ablations(report):
     alone = dataclasses.replace(report, runs=report.runs[:2])
     assert "Ablations" not in sweep_report.markdown(alone, {})

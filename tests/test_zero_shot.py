@@ -24,8 +24,8 @@ from tdanet_jax.vocabulary import ROOM_TYPES, Split, class_words, make_split
 from tdanet_jax.words import WordVectors
 from tests.handmade import FRAME
 
-SPLITS = [("18/4", False), ("14/8", False), ("18/4", True)]
-NAMES = ["18/4", "14/8", "18/4-validation"]
+SPLITS = [("18/4", False), ("14/8", False), ("18/4", True), ("Bread,Mug,Towel", True)]
+NAMES = ["18/4", "14/8", "18/4-validation", "own-validation"]
 
 
 def config_of(

@@ -20,6 +20,9 @@ from tests.experiments import command
 CASES: dict[str, list[tuple[str, str]]] = {
     "train_zero_shot": [
         ("--split 17/5", "--split 17/5: choose one of 22/0, 18/4, 14/8"),
+        ("--split Mug,Pilow", "--split Mug,Pilow: no target is called Pilow; did you mean Pillow?"),
+        ("--split Mug,mug", "--split Mug,mug: Mug is given twice"),
+        ("--split=", "--split : choose one of"),
         ("--model cnn", "--model cnn: choose one of tdanet"),
         ("--model no.such", "--model no.such: No module named 'no'"),
         ("--model os.path", "--model os.path: the module has no function `make`"),
@@ -58,6 +61,8 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("", "--policy sample needs --checkpoint"),
         ("--policy random --checkpoint full", "--policy random takes no --checkpoint"),
         ("--policy random --split 17/5", "--split 17/5: choose one of"),
+        ("--policy random --split=", "--split : choose one of"),
+        ("--policy random --split Mug,", "--split Mug,: a comma without a class on both sides"),
         ("--checkpoint full --split 18/4", "--split 18/4: a run is evaluated on its own split"),
         ("--policy random --history", "--policy random has no --history"),
         ("--checkpoint full --validation", "--validation: a trained run has its own rooms"),
@@ -117,6 +122,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("", "Missing from sweep: --out"),
         ("--out new --seed 3", "a sweep takes"),
         ("--out new --splits 17/5", "--split 17/5: choose one of 22/0, 18/4, 14/8"),
+        ("--out new --splits Mug,CD CD,Mug", "--splits: a value is given twice"),
         ("--out new --stepz 5", "Unrecognized options: --stepz, 5"),
         ("--out new --vmap-seeds --minutes 3", "--vmap-seeds needs a budget in --steps"),
         ("--out new --report-only --steps 5", "--report-only trains nothing and takes no --steps"),

@@ -1,14 +1,16 @@
 """The training command, as a user types it."""
 
 import json
+import re
 import signal
 import socket
 import time
+from pathlib import Path
 
 import pytest
 
 import tdanet_jax
-from experiments import train_zero_shot
+from experiments import evaluate, train_zero_shot
 from tdanet_jax import files
 from tests.experiments import command
 
@@ -63,6 +65,32 @@ def test_it_trains_evaluates_and_goes_on_after_kill_and_term(ithor, tmp_path, ca
     results = json.loads((out / "results.json").read_text())
     assert results["split"] == "14/8"
     assert results["seen"]["L>=1"]["n"] == results["unseen"]["L>=1"]["n"] == 1000
+
+
+def test_a_split_of_ones_own_is_trained_evaluated_and_gone_on_with(
+    ithor, few_episodes, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["--split", "towel,mug,CD", "--steps", "400", "--precision", "float32"]
+    train_zero_shot.main([*arguments, *command.TINY])
+    [run] = (tmp_path / "runs").iterdir()
+    assert re.fullmatch(r"Mug-CD-Towel-tdanet-seed0-\d{8}-\d{6}", run.name)
+    train_zero_shot.main(["--resume", str(run), "--steps", "600"])
+    results = json.loads((run / "results.json").read_text())
+    assert (results["split"], results["steps"]) == ("Mug,CD,Towel", 800)
+    # No room type without an unseen class has unseen episodes.
+    assert (results["seen"]["L>=1"]["n"], results["unseen"]["L>=1"]["n"]) == (100, 75)
+    unseen = {name for name, groups in results["by_target"].items() if "unseen" in groups}
+    assert unseen == {"Mug", "CD", "Towel"}
+    assert not any("seen" in results["by_target"][name] for name in unseen)
+
+    evaluate.main(["--checkpoint", str(run), "--out", "again"])
+    for name in ("episodes.jsonl", "results.json"):
+        assert Path("again", name).read_text() == (run / name).read_text()
+    agent = tdanet_jax.load(run)
+    assert agent.config.split == "Mug,CD,Towel"
+    known = {agent.classes.names[i] for i in agent.classes.known}
+    assert set(agent.classes.names) - known == unseen
 
 
 #: All that an agent may sense beyond the paper.
