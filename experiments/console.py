@@ -334,12 +334,11 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
 
 def print_summary(results: Mapping[str, Any]) -> None:
     """One line per group: seen targets, 1000 episodes: SR 75.1 (70.2 to 80.0), SPL ..."""
+    from tdanet_jax.metrics import shown
+
     for group in GROUPS:
         if results[group] is None:
             continue
         bucket = results[group]["L>=1"]
-        parts = []
-        for name in ("SR", "SPL"):
-            low, high = bucket[f"{name}_ci"]
-            parts.append(f"{name} {bucket[name]:.1f} ({low:.1f} to {high:.1f})")
+        parts = [f"{name} {shown(bucket, name)}" for name in ("SR", "SPL")]
         console.print(f"{group} targets, {bucket['n']} episodes: {', '.join(parts)}")

@@ -162,15 +162,19 @@ def evaluate_several(command: Command, networks: Sequence[Saved], folder: Path) 
     """Several runs, or the history of one or more."""
     from tdanet_jax import comparison, figures, files, report, saved
 
-    results, records = {}, []
+    results, records, played = {}, [], {}
     greedy = command.policy == "greedy"
     with reporter("evaluating") as show:
         for done in saved.evaluate(networks, greedy, command.seed):
             results[done.saved] = done.results()
+            if not command.history:
+                played[done.saved] = done.columns()
             where = {"run": str(done.saved.run), "updates": done.snapshot.updates}
             records += [{**where, **row} for row in report.all_rows(done.task.tables, done.played)]
             show(len(results) / len(networks), f"{done.saved.run.name} {done.snapshot.updates:,}")
-    ordered = [results[network] for network in networks]
+    ordered: list[comparison.Result] = [results[network] for network in networks]
+    if not command.history:
+        ordered = comparison.with_differences(ordered, [played[network] for network in networks])
     names = short_names(command.checkpoint)
     page = comparison.markdown(
         f"{len(networks)} checkpoints", ordered, [names[network.run] for network in networks]

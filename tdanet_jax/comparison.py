@@ -12,12 +12,16 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from tdanet_jax import paper
+import numpy as np
+
+from tdanet_jax import metrics, paper
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.metrics import BUCKETS
 from tdanet_jax.vocabulary import GROUPS
 
 Result = Mapping[str, Any]
+#: The records of a network by group, as the columns of `report.columns`.
+Columns = Mapping[str, Mapping[str, np.ndarray]]
 MEASURES = ("SR", "SPL")
 #: Flags that let an agent sense what the paper's do not.
 BEYOND = ("--odometry", "--triangulation")
@@ -140,6 +144,47 @@ def _groups(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return out
 
 
+def with_differences(results: Sequence[Result], played: Sequence[Columns]) -> list[Result]:
+    """Results with their `difference` to the first of the same episodes, group by group.
+
+    It is None for that first one itself. Otherwise `to` is the other's run; a group holds ours
+    minus theirs, as `metrics.difference` says it.
+
+    Args:
+      results: as `saved.Evaluated.results` gives them.
+      played: the records behind each.
+    """
+    out: list[Result] = []
+    for i, result in enumerate(results):
+        first = next(j for j in range(i + 1) if _same_episodes(results, played, i, j))
+        difference = None if first == i else {
+            "to": results[first]["run"],
+            **{
+                group: metrics.difference(played[i][group], played[first][group])
+                if group in played[i] else None
+                for group in GROUPS
+            },
+        }  # fmt: skip
+        out.append({**result, "difference": difference})
+    return out
+
+
+def _same_episodes(
+    results: Sequence[Result], played: Sequence[Columns], one: int, other: int
+) -> bool:
+    """Whether two networks began at the same points of the same rooms, for the same targets."""
+    ours, theirs = played[one], played[other]
+    return (
+        all(results[one][name] == results[other][name] for name in ("split", "data_version"))
+        and ours.keys() == theirs.keys()
+        and all(
+            np.array_equal(ours[group][name], theirs[group][name])
+            for group in ours
+            for name in ("scene", "target", "x", "z", "rotation", "horizon")
+        )
+    )
+
+
 def table(
     first: Sequence[str], rows: Iterable[tuple[Sequence[str], Mapping[str, Any]]]
 ) -> list[str]:
@@ -195,11 +240,14 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
             ((run, f"{r['updates']:,}", f"{r['episodes_trained']:,}", r["policy"]), r)
             for run, r in zip(names, own, strict=True)
         ]
+        rows += (differing := list(_differences(own, names)))
         rows += _means(own, names)
         for agent, groups in paper_rows(split).items():
             rows.append(((f"{agent} (paper)", "", "", ""), groups))
         lines += ["", f"## Split {split}", ""]
         lines += table(("Agent", "Updates", "Training episodes", "Actions"), rows)
+        if differing:
+            lines += ["", "Differences: in the same episodes, 95 % intervals (paired bootstrap)."]
         if paper_rows(split):
             worlds = dict.fromkeys(paper.worlds(result["data"]) for result in own)
             lines += ["", *worlds]
@@ -207,6 +255,23 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
 
 
 _Row = tuple[Sequence[str], Mapping[str, Any]]
+
+
+def _differences(results: Sequence[Result], names: Sequence[str]) -> Iterator[_Row]:
+    """A row for every network with a difference to another."""
+    for result, name in zip(results, names, strict=True):
+        if (difference := result.get("difference")) is None:
+            continue
+        to = next(n for r, n in zip(results, names, strict=True) if r["run"] == difference["to"])
+        groups = {
+            group: {
+                bucket: {measure: metrics.shown(part, measure) for measure in MEASURES}
+                for bucket, part in difference[group].items()
+            }
+            for group in GROUPS
+            if difference[group] is not None
+        }
+        yield (f"{name} minus {to}", "", "", result["policy"]), groups
 
 
 def _means(results: Sequence[Result], names: Sequence[str]) -> Iterator[_Row]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -31,17 +32,48 @@ def summarise(
     Returns:
       bucket -> SR, SPL, SR_ci, SPL_ci (each [low, high]) and n; None where n is 0.
     """
-    efficiency = spl(success, shortest, length)
+    return _averages(_rates(success, shortest, length), shortest, cluster)
+
+
+def difference(
+    ours: Mapping[str, np.ndarray], theirs: Mapping[str, np.ndarray]
+) -> dict[str, dict[str, object]]:
+    """By how much two agents differ in the same episodes: ours minus theirs, per bucket of L.
+
+    What is averaged and resampled are the differences of single episodes: how hard an episode is
+    for both does not widen the intervals (the paired bootstrap).
+
+    Args:
+      ours, theirs: `success`, `shortest`, `length` and `cluster` of the episodes (`summarise`).
+
+    Returns:
+      What `summarise` gives, of the differences; they are percentage points.
+    """
+    mine, other = (
+        _rates(*(column[name] for name in ("success", "shortest", "length")))
+        for column in (ours, theirs)
+    )
+    return _averages(mine - other, theirs["shortest"], theirs["cluster"])
+
+
+def _rates(success: np.ndarray, shortest: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Success and SPL of each episode in percent, [2, E]."""
+    return 100.0 * np.stack([success, spl(success, shortest, length)]).astype(np.float64)
+
+
+def _averages(
+    values: np.ndarray, shortest: np.ndarray, cluster: np.ndarray
+) -> dict[str, dict[str, object]]:
+    """Means and intervals of two values of each episode [2, E], per bucket of L."""
     out: dict[str, dict[str, object]] = {}
     for name, least in BUCKETS.items():
         chosen = shortest >= least
-        values = 100.0 * np.stack([success[chosen], efficiency[chosen]]).astype(np.float64)
         count = int(chosen.sum())
         if count == 0:
             out[name] = {"SR": None, "SPL": None, "SR_ci": None, "SPL_ci": None, "n": 0}
             continue
-        low, high = cluster_interval(values, cluster[chosen])
-        mean = values.mean(axis=1)
+        low, high = cluster_interval(values[:, chosen], cluster[chosen])
+        mean = values[:, chosen].mean(axis=1)
         out[name] = {
             "SR": _round(mean[0]),
             "SPL": _round(mean[1]),
@@ -50,6 +82,14 @@ def summarise(
             "n": count,
         }
     return out
+
+
+def shown(bucket: Mapping[str, Any], measure: str) -> str:
+    """A mean and its interval, as every table has them: 75.1 (70.2 to 80.0)."""
+    if bucket[measure] is None:
+        return "-"
+    low, high = bucket[f"{measure}_ci"]
+    return f"{bucket[measure]:z.1f} ({low:z.1f} to {high:z.1f})"
 
 
 def cluster_interval(values: np.ndarray, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -88,4 +128,4 @@ def grouped(
 
 
 def _round(value: float) -> float:
-    return round(float(value), 2)
+    return round(float(value), 2) + 0.0  # no minus zero

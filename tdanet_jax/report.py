@@ -16,7 +16,7 @@ import tdanet_jax
 from tdanet_jax import files, paper
 from tdanet_jax.episodes import Episodes
 from tdanet_jax.evaluation import Records
-from tdanet_jax.metrics import BUCKETS, grouped, summarise
+from tdanet_jax.metrics import BUCKETS, grouped, shown, summarise
 from tdanet_jax.scenes import poses
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS, GROUPS, ROOM_TYPES
@@ -255,7 +255,7 @@ def _row(first: tuple[str, ...], buckets: Mapping[str, Mapping[str, Any]]) -> st
     cells = [*first]
     for bucket in BUCKETS:
         part = buckets[bucket]
-        cells += [_cell(part, "SR"), _cell(part, "SPL"), str(part["n"])]
+        cells += [shown(part, "SR"), shown(part, "SPL"), str(part["n"])]
     return f"| {' | '.join(cells)} |"
 
 
@@ -265,10 +265,3 @@ def _paper_row(group: str, agent: str, rates: Mapping[str, paper.Rate]) -> str:
         rate = rates.get(bucket)
         cells += ["-", "-", ""] if rate is None else [f"{rate.sr:.1f}", f"{rate.spl:.1f}", ""]
     return f"| {' | '.join(cells)} |"
-
-
-def _cell(part: Mapping[str, Any], name: str) -> str:
-    if part[name] is None:
-        return "-"
-    low, high = part[f"{name}_ci"]
-    return f"{part[name]:.1f} ({low:.1f} to {high:.1f})"

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from tdanet_jax import classes, comparison, episodes, evaluation, history, policies, report
 from tdanet_jax import config as configs
@@ -76,18 +77,19 @@ class Evaluated:
         """The content of a `results.json`, after the run's folder and where the run was; the run's
         settings behind it. `point` and `share` are None where it is no point of a history."""
         point = None if self.saved.point is None else self.snapshot.point
-        groups = {
-            name: report.columns(self.task.tables, *pair) for name, pair in self.played.items()
-        }
         return {
             "run": str(self.saved.run),
             "point": point,
             "share": None if point is None else point / max(self.saved.config.history, 1),
             "updates": self.snapshot.updates,
             "training_seconds": round(self.snapshot.seconds, 1),
-            **report.results(self.provenance, groups),
+            **report.results(self.provenance, self.columns()),
             "settings": comparison.settings(self.saved.config),
         }
+
+    def columns(self) -> dict[str, dict[str, np.ndarray]]:
+        """Its records by group, as named columns."""
+        return {name: report.columns(self.task.tables, *pair) for name, pair in self.played.items()}
 
 
 def find(run: Path, with_history: bool = False, data: str | None = None) -> list[Saved]:

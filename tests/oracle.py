@@ -328,6 +328,32 @@ def generalised_advantages(
     ]
 
 
+def paired_differences(
+    ours: Mapping[str, Sequence], theirs: Mapping[str, Sequence], chosen: Sequence[int]
+) -> list[tuple[float, float, float]]:
+    """Of SR and of SPL: the difference, and the ends of its interval, from whole samples.
+
+    A sample takes as many clusters as there are, with replacement, and all their episodes; the
+    counts are drawn as the package draws them, so that the ends are the same ones.
+    """
+
+    def rates(agent: Mapping[str, Sequence], episodes: Sequence[int]) -> np.ndarray:
+        named = ([agent[name][i] for i in episodes] for name in ("success", "shortest", "length"))
+        return np.array(success_rate_and_spl(*named))
+
+    clusters = sorted({ours["cluster"][i] for i in chosen})
+    members = [[i for i in chosen if ours["cluster"][i] == cluster] for cluster in clusters]
+    rng = np.random.default_rng(0)
+    samples = []
+    for _ in range(2000):
+        counts = rng.multinomial(len(clusters), np.full(len(clusters), 1 / len(clusters)))
+        drawn = [i for count, own in zip(counts, members, strict=True) for i in own * count]
+        samples.append(rates(ours, drawn) - rates(theirs, drawn))
+    means = rates(ours, chosen) - rates(theirs, chosen)
+    ends = np.percentile(samples, [2.5, 97.5], axis=0)
+    return [(means[k], ends[0][k], ends[1][k]) for k in (0, 1)]
+
+
 def success_rate_and_spl(
     success: Sequence[bool], shortest: Sequence[int], length: Sequence[int]
 ) -> tuple[float, float]:

@@ -3,9 +3,10 @@
 import dataclasses
 import statistics
 
+import numpy as np
 import pytest
 
-from tdanet_jax import comparison, figures
+from tdanet_jax import comparison, figures, metrics
 from tdanet_jax.comparison import Spread
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 
@@ -65,6 +66,57 @@ def test_a_page_without_rows_of_the_paper_does_not_speak_of_its_world():
 def test_a_history_is_not_averaged_over_its_points():
     page = comparison.markdown("Two", [result(point=0), result(point=1)], ["a", "a"])
     assert "seeds" not in page
+
+
+def records(starts, success, length=None):
+    """Columns of one group of episodes of L = 6, one in each room."""
+    count = len(starts)
+    return {
+        "seen": {
+            "scene": np.array([f"FloorPlan{i}" for i in range(count)]),
+            "target": np.array(["Mug"] * count),
+            "x": np.array(starts, float), "z": np.zeros(count),
+            "rotation": np.zeros(count, int), "horizon": np.zeros(count, int),
+            "success": np.array(success, bool), "shortest": np.full(count, 6),
+            "length": np.full(count, 6) if length is None else np.array(length),
+            "cluster": np.arange(count),
+        }
+    }  # fmt: skip
+
+
+def test_differences_are_to_the_first_that_played_the_same_episodes():
+    here, there = (0, 1, 2, 3), (0, 1, 2, 4)
+    played = [
+        records(here, (0, 1, 0, 1)), records(there, (1, 1, 1, 1)), records(here, (1, 1, 0, 1)),
+        records(there, (0, 0, 0, 0)), records(here, (0, 1, 0, 1)), records(here, (0, 1, 0, 1)),
+    ]  # fmt: skip
+    results = [result(seed) | {"run": f"runs/{seed}"} for seed in range(6)]
+    results[5]["data_version"] = "e"  # the same starts, in other rooms
+    found = [r["difference"] for r in comparison.with_differences(results, played)]
+    assert [d and d["to"] for d in found] == [None, None, "runs/0", "runs/1", "runs/0", None]
+    assert found[2]["unseen"] is None
+    assert (
+        found[2]["seen"]["L>=5"] == metrics.difference(played[2]["seen"], played[0]["seen"])["L>=5"]
+    )
+    assert [d["seen"]["L>=1"]["SR"] for d in found if d] == [25, -100, 0]
+    assert found[4]["seen"]["L>=1"]["SPL_ci"] == [0, 0]
+    alone = comparison.with_differences(
+        [results[0], results[2] | {"split": "22/0"}], played[::2][:2]
+    )
+    assert [r["difference"] for r in alone] == [None, None]
+
+
+def test_the_page_has_a_row_for_every_difference():
+    played = [records(range(3), (0, 1, 0)), records(range(3), (1, 1, 1), (6, 12, 6))]
+    results = [result(seed) | {"run": f"runs/{name}"} for seed, name in enumerate("ab")]
+    page = comparison.markdown("Two", comparison.with_differences(results, played), ["a", "b"])
+    low, high = metrics.difference(played[1]["seen"], played[0]["seen"])["L>=1"]["SR_ci"]
+    assert f"| b minus a |  |  | sample | 66.7 ({low:.1f} to {high:.1f}) | 50.0 (" in page
+    assert (
+        page.index("| b | ") < page.index("| b minus a |") < page.index("| **tdanet, 2 seeds** |")
+    )
+    assert "Differences: in the same episodes, 95 % intervals (paired bootstrap)." in page
+    assert "minus" not in comparison.markdown("Two", results, ["a", "b"])
 
 
 def of(seed=0, sr=50.0, **values):

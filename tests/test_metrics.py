@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tdanet_jax import metrics
@@ -114,6 +114,85 @@ def test_intervals_are_the_same_on_every_call() -> None:
         metrics.cluster_interval(*sample), metrics.cluster_interval(*sample), strict=True
     ):
         np.testing.assert_array_equal(a, b)
+
+
+def columns(success, shortest, length, cluster) -> dict[str, np.ndarray]:
+    return {"success": success, "shortest": shortest, "length": length, "cluster": cluster}
+
+
+@st.composite
+def pairs(draw: st.DrawFn) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Two agents in the same episodes."""
+    success, shortest, length, cluster = draw(outcomes())
+    count = len(success)
+    wins = np.array(draw(st.lists(st.booleans(), min_size=count, max_size=count)))
+    extra = np.array(draw(st.lists(st.integers(0, 60), min_size=count, max_size=count)))
+    taken = np.where(wins, shortest, 1) + extra
+    return columns(success, shortest, length, cluster), columns(wins, shortest, taken, cluster)
+
+
+@settings(max_examples=12)
+@given(pairs())
+def test_differences_are_those_of_a_loop_over_resampled_pairs(both: tuple) -> None:
+    ours, theirs = both
+    out = metrics.difference(ours, theirs)
+    for bucket, least in (("L>=1", 1), ("L>=5", 5)):
+        chosen = [i for i, shortest in enumerate(ours["shortest"]) if shortest >= least]
+        assert out[bucket]["n"] == len(chosen)
+        if not chosen:
+            assert out[bucket]["SR"] is out[bucket]["SR_ci"] is None
+            continue
+        expected = oracle.paired_differences(ours, theirs, chosen)
+        for name, (mean, low, high) in zip(("SR", "SPL"), expected, strict=True):
+            assert out[bucket][name] == pytest.approx(mean, abs=0.006)
+            assert out[bucket][f"{name}_ci"] == pytest.approx([low, high], abs=0.006)
+
+
+@given(outcomes())
+def test_an_agent_does_not_differ_from_itself(episodes: tuple) -> None:
+    out = metrics.difference(columns(*episodes), columns(*episodes))
+    for bucket in out.values():
+        if bucket["n"]:
+            assert [metrics.shown(bucket, name) for name in ("SR", "SPL")] == 2 * [
+                "0.0 (0.0 to 0.0)"
+            ]
+            assert [bucket["SR"], *bucket["SR_ci"], bucket["SPL"], *bucket["SPL_ci"]] == 6 * [0]
+
+
+@given(pairs())
+def test_differences_the_other_way_round_are_the_same_with_the_other_sign(both: tuple) -> None:
+    there, back = metrics.difference(*both), metrics.difference(*both[::-1])
+    for bucket in there:
+        if there[bucket]["n"]:
+            for name in ("SR", "SPL"):
+                low, high = back[bucket][f"{name}_ci"]
+                assert there[bucket][name] == -back[bucket][name]
+                assert there[bucket][f"{name}_ci"] == pytest.approx([-high, -low], abs=0.011)
+
+
+def test_how_hard_an_episode_is_for_both_does_not_widen_the_interval_of_a_difference() -> None:
+    rng = np.random.default_rng(0)
+    cluster = np.repeat(np.arange(100), 5)
+    easy = np.repeat(rng.random(100) < 0.5, 5)  # both find what is easy, and little else
+    ours, theirs = (
+        columns(easy ^ (rng.random(500) < 0.02), np.full(500, 6), np.full(500, 6), cluster)
+        for _ in range(2)
+    )
+    paired = metrics.difference(ours, theirs)["L>=1"]["SR_ci"]
+    alone = metrics.summarise(*ours.values())["L>=1"]["SR_ci"]
+    assert paired[1] - paired[0] < 0.3 * (alone[1] - alone[0])
+
+
+@pytest.mark.parametrize(
+    ("bucket", "text"),
+    [
+        ({"SR": 1.25, "SR_ci": [-0.04, 12.0]}, "1.2 (0.0 to 12.0)"),
+        ({"SR": -3.21, "SR_ci": [-5.0, -0.1]}, "-3.2 (-5.0 to -0.1)"),
+        ({"SR": None, "SR_ci": None}, "-"),
+    ],
+)
+def test_a_mean_is_shown_with_its_interval(bucket: dict, text: str) -> None:
+    assert metrics.shown(bucket, "SR") == text
 
 
 def test_groups_hold_their_own_episodes_in_the_order_asked_for() -> None:

@@ -88,6 +88,35 @@ def test_the_history_of_two_runs_gives_a_curve_and_all_records(runs, few_episode
         assert result["unseen"]["L>=1"]["SR"] == pytest.approx(100 * sum(own) / 100)
 
 
+def test_two_runs_are_compared_episode_by_episode(
+    opinionated_run, rooms_file, few_episodes, tmp_path
+):
+    """Another seed of sampled actions, and the very same agent under another name."""
+    copies = []
+    for name, seed in (("seed1", 1), ("again", 0)):
+        copies.append(shutil.copytree(opinionated_run, tmp_path / name))
+        config = json.loads((copies[-1] / "config.json").read_text()) | {"seed": seed}
+        (copies[-1] / "config.json").write_text(json.dumps(config))
+    out, runs = tmp_path / "out", [opinionated_run, *copies]
+    chosen = [word for run in runs for word in ("--checkpoint", str(run))]
+    evaluate.main([*chosen, "--data", str(rooms_file), "--out", str(out)])
+    first, other, same = json.loads((out / "evaluations.json").read_text())
+    assert first["difference"] is None
+    for group in ("seen", "unseen"):
+        part = other["difference"][group]["L>=1"]
+        for name in ("SR", "SPL"):
+            apart = other[group]["L>=1"][name] - first[group]["L>=1"][name]
+            assert part[name] == pytest.approx(apart, abs=0.011)
+            assert part[f"{name}_ci"][0] <= part[name] <= part[f"{name}_ci"][1]
+            assert same["difference"][group]["L>=1"][name] == 0
+            assert same["difference"][group]["L>=1"][f"{name}_ci"] == [0, 0]
+    assert other["difference"]["to"] == same["difference"]["to"] == str(opinionated_run)
+    page = (out / "evaluations.md").read_text()
+    cells = " | ".join(["0.0 (0.0 to 0.0)"] * 8)
+    assert f"| again minus {opinionated_run.name} |  |  | sample | {cells} |" in page
+    assert f"| seed1 minus {opinionated_run.name} |" in page
+
+
 def test_one_run_gives_the_files_of_a_single_result_beside_it(ithor, tmp_path):
     run = shutil.copytree(OLD_RUN, tmp_path / "run")
     evaluate.main(["--checkpoint", str(run), "--policy", "greedy", "--seed", "5"])
@@ -133,6 +162,9 @@ def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch, capsys):
         def results(self):
             return made_up()
 
+        def columns(self):
+            return {}
+
     monkeypatch.setattr(saved, "evaluate", lambda networks, greedy, seed: [Done()])
     monkeypatch.setattr(report, "all_rows", lambda tables, played: 1000 * [{"group": "seen"}])
     command, out = evaluate.Command(checkpoint=(tmp_path / "a",)), tmp_path / "out"
@@ -140,7 +172,7 @@ def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch, capsys):
         evaluate.evaluate_several(command, [Done.saved], out)
     check_empty(out)
     evaluate.evaluate_several(command, [Done.saved], out)
-    assert json.loads((out / "evaluations.json").read_text()) == [made_up()]
+    assert json.loads((out / "evaluations.json").read_text()) == [made_up() | {"difference": None}]
     assert len((out / "episodes.jsonl").read_text().splitlines()) == 1000
 
 
