@@ -74,8 +74,9 @@ def test_a_process_on_its_own_agrees_with_itself():
 
 
 @pytest.mark.parametrize("model", ["tdanet", "mjolnir-r", "savn"])
-def test_an_update_can_be_lowered_for_a_gpu(some_rooms, glove, model):
+def test_an_update_can_be_lowered_for_a_gpu(some_rooms, glove, model, monkeypatch):
     # Not what it computes there, which needs one: that no part of it exists on CPUs alone.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     learning = LearnerConfig(num_envs=4, rollout_steps=6)
     network = NetworkConfig(precision="bfloat16")
     config = TrainConfig(model=model, network=network, learner=learning)

@@ -200,7 +200,11 @@ def test_without_a_tape_or_while_recording_values_are_computed() -> None:
     np.testing.assert_allclose(y, out[0], **CLOSE)
 
 
-def test_the_tape_of_a_bfloat16_network_gives_close_gradients() -> None:
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_the_tape_of_a_bfloat16_network_gives_close_gradients(
+    backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)  # the form that it takes there
     params, carry, x, fresh = example(seed=22)
     weight = normal(T, B, 2, seed=1)
 
