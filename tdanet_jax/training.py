@@ -270,6 +270,11 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
     config = runs[0].config
     one = learner.make_train(config.learner, runs[0].model, config.chunk_updates)
     several = jax.jit(jax.vmap(one, in_axes=(0, None, None, None)), donate_argnums=0)
+
+    @jax.jit  # one call for all arrays of all seeds
+    def apart(stacked: TrainState) -> list[TrainState]:
+        return [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(len(runs))]
+
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(run.state for run in runs))
     arguments = runs[0]._words, runs[0]._params
     journals = [run._journal() for run in runs]
@@ -280,9 +285,9 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
         metrics = jax.device_get(metrics)
         took = time.perf_counter() - began
         rows = []
-        for i, (run, journal) in enumerate(zip(runs, journals, strict=True)):
-            state, own = (jax.tree.map(lambda x, i=i: x[i], tree) for tree in (stacked, metrics))
-            rows.append(run._record(state, own, before, took, journal))
+        for i, (run, state) in enumerate(zip(runs, apart(stacked), strict=True)):
+            own = {name: values[i] for name, values in metrics.items()}
+            rows.append(run._record(state, own, before, took, journals[i]))
         yield rows
         for run in runs:
             run._check_finite()
