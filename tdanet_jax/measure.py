@@ -69,10 +69,16 @@ def processor() -> str:
 
 def machine_row(repeats: int) -> Row:
     """The machine's own limits: matrix products and memory."""
+    times = 5 if jax.default_backend() == "cpu" else 200  # an accelerator takes microseconds
 
     @jax.jit
     def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
-        return jnp.dot(a, b, preferred_element_type=jnp.float32)
+        def again(_: jax.Array, a: jax.Array) -> jax.Array:
+            product = jnp.dot(a, b, preferred_element_type=jnp.float32)
+            # The next one waits for this one, and for all of it.
+            return (product[:, :1024] + product[:, 1024:]).astype(a.dtype)
+
+        return jax.lax.fori_loop(0, times, again, a)
 
     add_one = jax.jit(lambda x: x + 1)
     row: Row = {"part": "machine"}
@@ -80,9 +86,9 @@ def machine_row(repeats: int) -> Row:
         best = 0.0
         for batch in (512, 1024, 2048):
             a = jax.random.normal(jax.random.key(0), (batch, 1024)).astype(dtype)
-            b = jax.random.normal(jax.random.key(1), (1024, 2048)).astype(dtype)
-            _, seconds = timed(functools.partial(multiply, a, b), 4 * repeats, inner=5)
-            best = max(best, 2 * batch * 1024 * 2048 / seconds / 1e9)
+            b = (jax.random.normal(jax.random.key(1), (1024, 2048)) / 45).astype(dtype)
+            _, seconds = timed(functools.partial(multiply, a, b), 4 * repeats)
+            best = max(best, times * 2 * batch * 1024 * 2048 / seconds / 1e9)
         row[f"{name}_gflops"] = round(best, 1)
     big = jnp.zeros(2**26, jnp.float32)
     _, seconds = timed(functools.partial(add_one, big), repeats, inner=2)
@@ -202,7 +208,7 @@ def update_cost(
     compiled = chunk.lower(state, share, words, params).compile()
     compile_seconds = time.perf_counter() - began
     memory: Any = compiled.memory_analysis()
-    cost: Any = compiled.cost_analysis()
+    cost: Any = compiled.cost_analysis() or {}  # not every backend counts
 
     def call() -> Any:
         nonlocal state
@@ -214,8 +220,8 @@ def update_cost(
         "environments": count,
         "compile_seconds": round(compile_seconds, 2),
         "steps_per_second": round(count * config.rollout_steps * updates / seconds),
-        "megaflop_per_step_compiled": round(cost["flops"] / count / 1e6, 2),
-        "kilobytes_per_step_compiled": round(cost["bytes accessed"] / count / 1e3, 1),
+        "megaflop_per_step_compiled": round(cost.get("flops", 0) / count / 1e6, 2),
+        "kilobytes_per_step_compiled": round(cost.get("bytes accessed", 0) / count / 1e3, 1),
         "arguments_mb": round(memory.argument_size_in_bytes / 1e6, 1),
         "temporary_mb": round(memory.temp_size_in_bytes / 1e6, 1),
     }

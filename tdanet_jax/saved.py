@@ -21,6 +21,7 @@ from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.episodes import Episodes
 from tdanet_jax.evaluation import Records
 from tdanet_jax.history import Snapshot
+from tdanet_jax.models.adaptation import AdaptiveActorCritic
 from tdanet_jax.task import Task, load_task
 
 #: Networks in one call; bounds the memory that a long list takes.
@@ -135,7 +136,11 @@ def evaluate(
                 lambda *leaves: jnp.stack(leaves), *(s.weights for s in snapshots)
             )
             seeds = [network.config.seed if seed is None else seed for network in part]
-            played = evaluation.evaluate_stacked(policy, weights, task.eval_params, lists, seeds)
+            # Side by side, networks that adapt would do so in every step.
+            batched = False if isinstance(task.model, AdaptiveActorCritic) else None
+            played = evaluation.evaluate_stacked(
+                policy, weights, task.eval_params, lists, seeds, batched
+            )
             for network, snapshot, own, drawn in zip(part, snapshots, played, seeds, strict=True):
                 yield Evaluated(
                     saved=network,

@@ -99,6 +99,12 @@ def glove() -> WordVectors:
     return words.load_bundled()
 
 
+@pytest.fixture(params=["cpu", "gpu"])
+def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs in the form that they take on each backend; what they compute, a CPU tells."""
+    monkeypatch.setattr(jax, "default_backend", lambda: request.param)
+
+
 #: The network of `opinionated_run`.
 TINY = TrainConfig(network=NetworkConfig(width=16, hidden=16, precision="float32"))
 

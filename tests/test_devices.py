@@ -1,6 +1,7 @@
 """One update on eight devices is the update on one; what cannot be laid out is refused."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -29,6 +30,10 @@ for over in (Mesh(np.array(jax.devices()[:1]), (devices.AXIS,)), mesh):
     state = jax.device_put(state, layout)
     words, params = jax.device_put((WORDS, PARAMS), devices.everywhere(over))
     chunk = learner.make_train(config, MODEL, 1, (layout, devices.everywhere(over)))
+    chunk = chunk.lower(state, jax.numpy.zeros(2), words, params).compile()
+    # Devices add up their gradients. What each has seen stays where it is.
+    assert "all-gather" not in chunk.as_text()
+    assert ("all-reduce" in chunk.as_text()) == (over.size > 1)
     after, metrics = chunk(state, jax.numpy.zeros(2), words, params)
     assert {len(x.sharding.device_set) for x in jax.tree.leaves(after)} == {over.size}
     assert after.previous.addressable_shards[0].data.shape == (24 // over.size, 6)
@@ -88,3 +93,9 @@ def test_an_update_can_be_lowered_for_a_gpu(some_rooms, glove, model, monkeypatc
     traced = learner.make_train(learning, task.model, 1).trace(state, jnp.zeros(2), *arguments)
     program = traced.lower(lowering_platforms=("cuda",)).as_text()
     assert "dot_general" in program
+    # GPUs scatter in any order. Sums of floats would differ from run to run, unless each is of one
+    # number, as is the gradient of the chosen action's log-probability.
+    scatters = re.findall(r"stablehlo\.scatter.*?\}\) : \(tensor<([\w]+)>", program, re.DOTALL)
+    bodies = re.findall(r"stablehlo\.scatter.*?\}\) :", program, re.DOTALL)
+    sums = [to for to, body in zip(scatters, bodies, strict=True) if "stablehlo.add" in body]
+    assert sums == ["6x4x6xf32"]

@@ -28,7 +28,7 @@ from flax import struct
 
 from tdanet_jax.env import RASTER, Observation
 from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.layers import Linear
+from tdanet_jax.models.layers import Linear, look_up
 
 #: Cells of an image.
 CELLS = RASTER[0] * RASTER[1]
@@ -93,7 +93,7 @@ class ImageTrunk(nn.Module):
           keep: [..., DROPOUT_UNITS] bool, units that dropout keeps; None when not training.
         """
         lead = obs.target.shape
-        target = table.target[obs.target] + self.target.own(table.words[obs.target])
+        target = look_up(table.target, obs.target) + self.target.own(table.words[obs.target])
         context = self.context(jnp.concatenate([nn.relu(target), action], axis=-1))[..., None, :]
         drops = keep is not None and self.dropout > 0
         if not self.maps and not drops and not self.convolution.adapted:
@@ -173,8 +173,11 @@ def _lookup_bwd(dtype: Any, saved: tuple, cotangent: jax.Array) -> tuple[jax.Arr
         values = cotangent.reshape(-1, width).astype(dtype)
         return total + jnp.dot(chosen, values, preferred_element_type=jnp.float32), None
 
+    nothing = jnp.zeros((rows.shape[0], width))
+    if index.ndim <= 2:  # a single step
+        return add(nothing, (index, cotangent))[0], None
     # One step at a time: the one-hot rows of a whole rollout would not fit the processor's cache.
-    return jax.lax.scan(add, jnp.zeros((rows.shape[0], width)), (index, cotangent))[0], None
+    return jax.lax.scan(add, nothing, (index, cotangent))[0], None
 
 
 lookup.defvjp(_lookup_fwd, _lookup_bwd)

@@ -9,7 +9,6 @@ it again. Gradients are those of the plain form.
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -37,15 +36,32 @@ def _keeps_transposed(dtype: Any) -> bool:
     return jnp.dtype(dtype) == jnp.bfloat16 and jax.default_backend() == "cpu"
 
 
-def _rows(a: jax.Array) -> jax.Array:
-    """[..., n] -> [rows, n], where n may be 0."""
-    return a.reshape(math.prod(a.shape[:-1]), a.shape[-1])
-
-
 def _dot(a: jax.Array, b: jax.Array, dtype: Any) -> jax.Array:
     """a [..., n] @ b [n, m] with operands in `dtype`, accumulated and returned in float32."""
-    out = jnp.dot(_rows(a).astype(dtype), b.astype(dtype), preferred_element_type=jnp.float32)
-    return out.reshape(*a.shape[:-1], b.shape[-1])
+    return jnp.dot(a.astype(dtype), b.astype(dtype), preferred_element_type=jnp.float32)
+
+
+def _dot_rows(a: jax.Array, b: jax.Array, dtype: Any) -> jax.Array:
+    """The sum over rows of a [..., n] times b [..., m], [n, m]; as `_dot`.
+
+    Time and environments stay axes of their own: as one, devices that share the environments would
+    have to exchange them all. On a processor step by step, whose operands its caches hold.
+    """
+
+    def over_rows(a: jax.Array, b: jax.Array) -> jax.Array:
+        rows = tuple(range(a.ndim - 1))
+        a, b = a.astype(dtype), b.astype(dtype)
+        return jax.lax.dot_general(
+            a, b, ((rows, rows), ((), ())), preferred_element_type=jnp.float32
+        )
+
+    if a.ndim == 2 or jax.default_backend() != "cpu":
+        return over_rows(a, b)
+
+    def add(total: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        return total + over_rows(*step), None
+
+    return jax.lax.scan(add, jnp.zeros((a.shape[-1], b.shape[-1])), (a, b))[0]
 
 
 def _pack(x: jax.Array) -> jax.Array:
@@ -94,7 +110,7 @@ def _product_fwd(x: jax.Array, kernel: jax.Array, dtype: Any) -> tuple[jax.Array
 
 def _product_bwd(dtype: Any, saved: tuple, cotangent: jax.Array) -> tuple[jax.Array, jax.Array]:
     x, kernel = saved
-    return _dot(cotangent, kernel.T, dtype), _dot(_rows(x).T, _rows(cotangent), dtype)
+    return _dot(cotangent, kernel.T, dtype), _dot_rows(x, cotangent, dtype)
 
 
 product.defvjp(_product_fwd, _product_bwd)
@@ -166,6 +182,28 @@ def _recall_product_bwd(dtype: Any, saved: tuple, cotangent: jax.Array) -> tuple
 
 
 recall_product.defvjp(_recall_product_fwd, _recall_product_bwd)
+
+
+def look_up(table: jax.Array, index: jax.Array) -> jax.Array:
+    """Rows of a table that is learned: [C, n] at index [...] -> [..., n].
+
+    On a GPU as a product with one-hot rows: the gradient of a plain look-up is added up there in
+    whatever order threads come, and a run could not be repeated to the last bit.
+    """
+    if jax.default_backend() == "cpu":
+        return table[index]
+    return jnp.dot(jax.nn.one_hot(index, len(table)), table, precision="highest")
+
+
+def look_up_in_rows(table: jax.Array, row: jax.Array, column: jax.Array) -> jax.Array:
+    """Entries of a table that is learned: [R, C] at row [...], column [..., K] -> [..., K].
+
+    As `look_up`.
+    """
+    if jax.default_backend() == "cpu":
+        return table[row[..., None], column]
+    rows = look_up(table, row)[..., None, :]
+    return jnp.sum(jax.nn.one_hot(column, table.shape[1]) * rows, axis=-1)
 
 
 def recorded(module: nn.Module, name: str, compute: Callable[[], Any]) -> Any:

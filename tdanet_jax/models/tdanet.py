@@ -26,7 +26,7 @@ from tdanet_jax.config import NetworkConfig
 from tdanet_jax.env import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.layers import Linear
+from tdanet_jax.models.layers import Linear, look_up, look_up_in_rows
 
 #: Centre and area that stand before the target's word vector in its row.
 TARGET_BOX = (0.5, 0.5, 0.25)
@@ -100,9 +100,9 @@ class TDANetEncoder(Encoder):
         mask = obs.mask | (obs.empty[..., None] & first)
         if not self.target_attention:
             return mask / mask.sum(-1, keepdims=True)
-        target = obs.target[..., None]
-        logits = table.class_logits[target, obs.classes]
-        logits += jnp.einsum("...i,...ki->...k", table.box_logits[obs.target], obs.boxes)
+        logits = look_up_in_rows(table.class_logits, obs.target, obs.classes)
+        units = look_up(table.box_logits, obs.target)
+        logits += jnp.einsum("...i,...ki->...k", units, obs.boxes)
         self.sow("intermediates", "correspondence", logits)
         return nn.softmax(logits, axis=-1, where=mask)
 
@@ -122,7 +122,7 @@ class TDANetEncoder(Encoder):
         names = pool(worded, obs.classes, table.words)
         features = self.branch(jnp.concatenate([boxes, names], axis=-1))
         if self.siamese:
-            features = jnp.abs(features - table.reference[obs.target])
+            features = jnp.abs(features - look_up(table.reference, obs.target))
             self.sow("intermediates", "difference", features)
         if keep is not None and self.dropout > 0:
             features = jnp.where(keep, features / (1 - self.dropout), 0.0)

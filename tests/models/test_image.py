@@ -108,10 +108,11 @@ def test_the_fast_forms_have_the_gradient_of_the_published_network(
     chex.assert_trees_all_close(grads, jax.grad(slow)(parameters(model)), rtol=2e-4, atol=1e-4)
 
 
-def test_a_lookup_has_the_gradient_of_plain_indexing() -> None:
+@pytest.mark.parametrize("lead", [(2,), (1, 2), (3, 2)])
+def test_a_lookup_has_the_gradient_of_plain_indexing(lead: tuple[int, ...]) -> None:
     table = jnp.asarray(np.random.default_rng(0).normal(size=(5, 3)), jnp.float32)
-    index = jnp.asarray([[0, 4, 4], [2, 0, 4]])
-    mix = jnp.asarray(np.random.default_rng(1).normal(size=(2, 3, 3)), jnp.float32)
+    index = jnp.asarray(np.random.default_rng(2).integers(0, 5, (*lead, 3)))
+    mix = jnp.asarray(np.random.default_rng(1).normal(size=(*lead, 3, 3)), jnp.float32)
     fast = jax.value_and_grad(lambda x: (lookup(x, index, jnp.float32) * mix).sum())(table)
     slow = jax.value_and_grad(lambda x: (x[index] * mix).sum())(table)
     chex.assert_trees_all_close(fast, slow, rtol=1e-6)

@@ -88,7 +88,7 @@ def test_the_fast_forms_equal_the_printed_equations(
 
 @pytest.mark.parametrize(("attention", "siamese"), ABLATIONS, ids=IDS)
 def test_the_fast_forms_have_the_gradient_of_the_printed_equations(
-    attention: bool, siamese: bool
+    attention: bool, siamese: bool, backend: None
 ) -> None:
     params, words, obs = parameters(attention, siamese), samples.words(), observations(FRAMES)
     keep = kept((FRAMES,))
