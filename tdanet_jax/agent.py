@@ -20,7 +20,7 @@ from tdanet_jax import classes as vocabularies
 from tdanet_jax import config as configs
 from tdanet_jax import history, odometry
 from tdanet_jax import words as word_vectors
-from tdanet_jax.checkpoint import FOLDER, Checkpoints
+from tdanet_jax.checkpoint import newest
 from tdanet_jax.classes import Classes
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.detections import centre_and_area, merge_classes
@@ -267,7 +267,5 @@ def read(run: Path | str) -> tuple[TrainConfig, Any, Classes]:
     point = path.suffix == history.SUFFIX
     folder = path.parent.parent if point else path
     config = configs.load(folder / CONFIG_FILE)
-    if not point and not (folder / FOLDER).is_dir():
-        raise ValueError(f"{folder / FOLDER}: no checkpoint")
-    weights = history.read(path).weights if point else Checkpoints(folder).weights()
-    return config, weights, vocabularies.load(folder)
+    snapshot = history.read(path) if point else newest(folder)
+    return config, snapshot.weights, vocabularies.load(folder)

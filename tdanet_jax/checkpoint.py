@@ -23,7 +23,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from tdanet_jax import assets, files
+from tdanet_jax import assets, files, history
 from tdanet_jax.history import Snapshot
 from tdanet_jax.learner import TrainState
 
@@ -38,6 +38,21 @@ logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 class NewerFormat(ValueError):
     """A checkpoint that only a newer version can read."""
+
+
+def newest(run: Path) -> Snapshot:
+    """The newest network of a run: its newest checkpoint's; in a folder without any, as they are
+    passed on, that of its history's last point.
+
+    Raises:
+      ValueError: the folder holds none, or none can be read.
+    """
+    checkpoints, point = Checkpoints(run), history.newest(run)
+    if checkpoints.latest() is not None:
+        return checkpoints.snapshot()
+    if point is None:
+        raise ValueError(f"{run / FOLDER}: no checkpoint")
+    return history.read(point)
 
 
 class Checkpoints:
@@ -112,10 +127,6 @@ class Checkpoints:
         blank = jax.tree.map(lambda x: np.empty(x.shape, x.dtype), shapes)
         state, meta = self._read(blank)
         return state.replace(key=jax.random.wrap_key_data(state.key)), meta
-
-    def weights(self) -> Any:
-        """The parameters of the newest checkpoint; errors as in `snapshot`."""
-        return self._read(None)[0]["params"]
 
     def snapshot(self) -> Snapshot:
         """The network of the newest checkpoint, without knowing anything else of the run.

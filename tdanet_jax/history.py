@@ -2,7 +2,8 @@
 
 `DIR/history/<updates>.npz` holds the parameters alone, by their path in the network
 (`encoder/linear2/kernel`), and where the run was, behind names that begin with @.
-Checkpoints, which resume a run, hold three times as much, and only the newest are kept.
+Checkpoints, which resume a run, hold three times as much, and only the newest are kept. A folder
+that is passed on (`share`) has one point and no checkpoint.
 """
 
 from __future__ import annotations
@@ -57,11 +58,22 @@ def due(before: float, after: float, points: int) -> int:
     return reached if reached > passed else 0
 
 
-def write(run: Path, snapshot: Snapshot) -> Path:
-    """Adds a point; the file appears complete or not at all."""
+def write(run: Path, snapshot: Snapshot, half: bool = False) -> Path:
+    """Adds a point; the file appears complete or not at all.
+
+    Args:
+      half: keeps 16 bits of each parameter (float16).
+
+    Raises:
+      ValueError: a parameter is too large for that.
+    """
     path = run / FOLDER / f"{snapshot.updates:08d}{SUFFIX}"
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     arrays = traverse_util.flatten_dict(jax.device_get(snapshot.weights), sep="/")
+    if half:
+        if any(abs(array).max(initial=0) > np.finfo(np.float16).max for array in arrays.values()):
+            raise ValueError(f"{run}: a parameter does not fit into float16")
+        arrays = {name: array.astype(np.float16) for name, array in arrays.items()}
     where = {name: getattr(snapshot, name) for name in _WHERE} | {"format": FORMAT}
     content: dict[str, Any] = arrays | {f"@{name}": np.array(v) for name, v in where.items()}
     with files.replacing(path) as fresh, fresh.open("wb") as file:
@@ -79,6 +91,7 @@ def read(path: Path) -> Snapshot:
         with np.load(path, allow_pickle=False) as data:
             content = {name: data[name] for name in data.files}
             where = {name[1:]: content.pop(name).item() for name in data.files if name[0] == "@"}
+        content = {name: array.astype(np.float32) for name, array in content.items()}
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file") from None
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
@@ -109,6 +122,11 @@ def checksums(path: Path) -> list[tuple[str, int]]:
 def points(run: Path) -> list[Path]:
     """The files of a run's history, oldest first."""
     return sorted(path for path in (run / FOLDER).glob(f"*{SUFFIX}") if path.stem.isdecimal())
+
+
+def newest(run: Path) -> Path | None:
+    """The file of the last point, if there is one."""
+    return next(reversed(points(run)), None)
 
 
 def drop_after(run: Path, updates: int) -> None:

@@ -7,6 +7,7 @@ curve of a run's whole history costs one compilation.
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from tdanet_jax import classes, comparison, episodes, evaluation, history, policies, report
 from tdanet_jax import config as configs
-from tdanet_jax.checkpoint import Checkpoints
+from tdanet_jax.checkpoint import Checkpoints, newest
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.episodes import Episodes
 from tdanet_jax.evaluation import Records
@@ -37,7 +38,7 @@ class Saved:
     Attributes:
       run: its run's folder.
       config: its run's configuration.
-      point: a file of the run's history, or None for the newest checkpoint.
+      point: a file of the run's history, or None for its newest network.
       data: file of rooms to evaluate in; None for those of its training.
     """
 
@@ -53,7 +54,7 @@ class Saved:
 
     def load(self) -> Snapshot:
         """Reads it. Raises ValueError if it cannot be read."""
-        return Checkpoints(self.run).snapshot() if self.point is None else history.read(self.point)
+        return newest(self.run) if self.point is None else history.read(self.point)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,12 +104,32 @@ def find(run: Path, with_history: bool = False, data: str | None = None) -> list
       ValueError: the folder holds no run, or none of its networks.
     """
     config = configs.load(run / CONFIG_FILE)
-    points: list[Path | None] = [*history.points(run)] if with_history else [None]
-    if with_history and not points:
-        raise ValueError(f"{run / history.FOLDER}: no history; train with --history above 0")
-    if not with_history and Checkpoints(run).latest() is None:
+    if with_history:
+        points: list[Path | None] = [*history.points(run)]
+        if not points:
+            raise ValueError(f"{run / history.FOLDER}: no history; train with --history above 0")
+        return [Saved(run, config, point, data) for point in points]
+    if Checkpoints(run).latest() is None and history.newest(run) is None:
         raise ValueError(f"{run}: no checkpoint")
-    return [Saved(run, config, point, data) for point in points]
+    return [Saved(run, config, None, data)]
+
+
+def share(run: Path, out: Path) -> None:
+    """Makes a small folder of a run's newest network: enough to load, evaluate and look at.
+
+    It holds the configuration, the classes, the network with 16 bits a parameter, and the run's
+    results if there are any; nothing to go on training with.
+
+    Raises:
+      ValueError: the folder holds no run, or its network cannot be read or does not fit.
+    """
+    network = find(run)[0]
+    history.write(out, network.load(), half=True)
+    configs.save(network.config, out / CONFIG_FILE)
+    classes.load(run).save(out)
+    for name in (report.RESULTS_FILE, report.RESULTS_PAGE):
+        if (run / name).is_file():
+            shutil.copyfile(run / name, out / name)
 
 
 def evaluate(

@@ -61,7 +61,7 @@ def saved(tmp_path: Path) -> Checkpoints:
     """Two checkpoints, of 1 and of 2 updates."""
     checkpoints = Checkpoints(tmp_path)
     for updates in (1, 2):
-        checkpoints.save(after(updates), {"seconds": 0.5 * updates})
+        checkpoints.save(after(updates), {"seconds": 0.5 * updates, "data_version": "d"})
     return checkpoints
 
 
@@ -79,7 +79,7 @@ def test_a_state_comes_back_bit_for_bit(saved: Checkpoints) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert restored(saved) == 2
-        chex.assert_trees_all_equal(saved.weights(), after(2).params)
+        chex.assert_trees_all_equal(saved.snapshot().weights, after(2).params)
 
 
 def test_the_newest_two_are_kept(saved: Checkpoints) -> None:

@@ -140,7 +140,7 @@ def test_seeds_trained_together_go_the_way_of_each_alone(whole, task, tmp_path):
 
 def test_the_weights_of_a_run_are_read_alone(whole):
     folder, run, _ = whole
-    weights = Checkpoints(folder).weights()
+    weights = Checkpoints(folder).snapshot().weights
     for ours, theirs in zip(
         jax.tree.leaves(weights), jax.tree.leaves(run.state.params), strict=True
     ):

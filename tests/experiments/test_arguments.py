@@ -89,6 +89,12 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--parts everything", "invalid choice 'everything'"),
         ("--out full", "--out full: exists"),
     ],
+    "share": [
+        ("", "Missing from share: --checkpoint PATH"),
+        ("--checkpoint bare --out full", "--out full: exists and is not empty"),
+        ("--checkpoint bare --out new", "bare: no checkpoint"),
+        ("--checkpoint nowhere --out new", "nowhere/config.json: no such file"),
+    ],
     "replay": [
         ("", "give --checkpoint"),
         ("--checkpoint bare", "give --scene and --target, or --episode"),

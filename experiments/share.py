@@ -1,0 +1,40 @@
+"""Makes a small folder of a trained agent, to keep or to pass on.
+
+    python -m experiments.share --checkpoint runs/... --out agents/mine
+
+A twentieth of a run: its newest network with 16 bits a parameter, configuration, classes, results.
+Enough to load, evaluate, replay and look at; not to go on training.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from experiments.console import check_empty, console, one_line_errors, parse
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Makes a small folder of a trained agent."""
+
+    checkpoint: Path
+    """Folder of a run."""
+    out: Path
+    """Folder to write; must be new or empty."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command."""
+    command = parse(Command, arguments, prog="share", description=__doc__)
+    with one_line_errors():
+        check_empty(command.out)
+        from tdanet_jax import saved
+
+        saved.share(command.checkpoint, command.out)
+        size = sum(path.stat().st_size for path in command.out.rglob("*") if path.is_file())
+        console.print(f"{size / 1e6:.1f} MB in {command.out}")
+
+
+if __name__ == "__main__":
+    main()
