@@ -2,8 +2,8 @@
 
     python -m experiments.share --checkpoint runs/... --out agents/mine
 
-A twentieth of a run: its newest network with 16 bits a parameter, configuration, classes, results.
-Enough to load, evaluate, replay and look at; not to go on training.
+A fiftieth of a run: its newest network with 16 bits a parameter, configuration, classes, results
+and records. Enough to load, evaluate, replay and look at; not to go on training.
 """
 
 from __future__ import annotations

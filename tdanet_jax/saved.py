@@ -118,7 +118,7 @@ def share(run: Path, out: Path) -> None:
     """Makes a small folder of a run's newest network: enough to load, evaluate and look at.
 
     It holds the configuration, the classes, the network with 16 bits a parameter, and the run's
-    results if there are any; nothing to go on training with.
+    results and records if there are any; nothing to go on training with.
 
     Raises:
       ValueError: the folder holds no run, or its network cannot be read or does not fit.
@@ -127,7 +127,7 @@ def share(run: Path, out: Path) -> None:
     history.write(out, network.load(), half=True)
     configs.save(network.config, out / CONFIG_FILE)
     classes.load(run).save(out)
-    for name in (report.RESULTS_FILE, report.RESULTS_PAGE):
+    for name in (report.RESULTS_PAGE, report.EPISODES_FILE, report.RESULTS_FILE):
         if (run / name).is_file():
             shutil.copyfile(run / name, out / name)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import chex
@@ -28,16 +29,19 @@ def decision(run: Path) -> np.ndarray:
 
 
 def test_what_is_passed_on_is_the_network(opinionated_run: Path, tmp_path: Path) -> None:
-    (opinionated_run / report.RESULTS_PAGE).write_text("results")
-    saved.share(opinionated_run, tmp_path / "shared")
-    whole, half = newest(opinionated_run), newest(tmp_path / "shared")
+    run, shared = tmp_path / "run", tmp_path / "shared"
+    shutil.copytree(opinionated_run, run)
+    (run / report.RESULTS_PAGE).write_text("results")
+    saved.share(run, shared)
+    whole, half = newest(run), newest(shared)
     chex.assert_trees_all_close(half.weights, whole.weights, rtol=2**-10, atol=2**-24)
     assert {leaf.dtype for leaf in jax.tree.leaves(half.weights)} == {np.dtype(np.float32)}
     assert (half.updates, half.data_version) == (whole.updates, whole.data_version)
-    np.testing.assert_allclose(decision(tmp_path / "shared"), decision(opinionated_run), atol=1e-2)
-    assert (tmp_path / "shared" / report.RESULTS_PAGE).read_text() == "results"
+    np.testing.assert_allclose(decision(shared), decision(run), atol=1e-2)
+    for name in (report.RESULTS_PAGE, report.EPISODES_FILE):
+        assert (shared / name).read_text() == (run / name).read_text()
     # And on from there.
-    saved.share(tmp_path / "shared", tmp_path / "again")
+    saved.share(shared, tmp_path / "again")
     chex.assert_trees_all_equal(newest(tmp_path / "again").weights, half.weights)
 
 
