@@ -108,12 +108,11 @@ def resumed(command: Command) -> TrainConfig:
             "--resume goes on as the run began: beside it, a new budget (--steps, --episodes, "
             "--minutes), --devices and --tensorboard alone"
         )
-    from tdanet_jax.checkpoint import Checkpoints
-    from tdanet_jax.report import RESULTS_FILE
+    from tdanet_jax.checkpoint import is_passed_on
 
     assert folder is not None
     config = configs.load(folder / CONFIG_FILE)
-    if Checkpoints(folder).latest() is None and (folder / RESULTS_FILE).exists():
+    if is_passed_on(folder):
         fail(f"--resume {folder}: an agent that was passed on; there is nothing to go on from")
     if new != TrainConfig():
         config = config.with_budget(new)

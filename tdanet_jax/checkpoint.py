@@ -41,18 +41,22 @@ class NewerFormat(ValueError):
 
 
 def newest(run: Path) -> Snapshot:
-    """The newest network of a run: its newest checkpoint's; in a folder without any, as they are
-    passed on, that of its history's last point.
+    """The network of a run's newest checkpoint, or of a folder that was passed on.
 
     Raises:
       ValueError: the folder holds none, or none can be read.
     """
-    checkpoints, point = Checkpoints(run), history.newest(run)
-    if checkpoints.latest() is not None:
-        return checkpoints.snapshot()
-    if point is None:
+    if is_passed_on(run):
+        return history.read(run / history.NETWORK)
+    checkpoints = Checkpoints(run)
+    if checkpoints.latest() is None:
         raise ValueError(f"{run / FOLDER}: no checkpoint")
-    return history.read(point)
+    return checkpoints.snapshot()
+
+
+def is_passed_on(run: Path) -> bool:
+    """Whether a folder holds a trained network and nothing to go on training with."""
+    return (run / history.NETWORK).exists()
 
 
 class Checkpoints:

@@ -3,7 +3,7 @@
 `DIR/history/<updates>.npz` holds the parameters alone, by their path in the network
 (`encoder/linear2/kernel`), and where the run was, behind names that begin with @.
 Checkpoints, which resume a run, hold three times as much, and only the newest are kept. A folder
-that is passed on (`share`) has one point and no checkpoint.
+that is passed on has neither, but one such file beside its configuration, `NETWORK`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from tdanet_jax import files
 
 FOLDER = "history"
 SUFFIX = ".npz"
+#: The network of a folder that is passed on (`saved.share`).
+NETWORK = "network.npz"
 #: Version of the files' layout; `read` refuses a newer one.
 FORMAT = 1
 
@@ -58,8 +60,16 @@ def due(before: float, after: float, points: int) -> int:
     return reached if reached > passed else 0
 
 
-def write(run: Path, snapshot: Snapshot, half: bool = False) -> Path:
-    """Adds a point; the file appears complete or not at all.
+def write(run: Path, snapshot: Snapshot) -> Path:
+    """Adds a point; the file appears complete or not at all."""
+    path = run / FOLDER / f"{snapshot.updates:08d}{SUFFIX}"
+    path.parent.mkdir(exist_ok=True)
+    save(path, snapshot)
+    return path
+
+
+def save(path: Path, snapshot: Snapshot, half: bool = False) -> None:
+    """Writes a snapshot; the file appears complete or not at all.
 
     Args:
       half: keeps 16 bits of each parameter (float16).
@@ -67,18 +77,15 @@ def write(run: Path, snapshot: Snapshot, half: bool = False) -> Path:
     Raises:
       ValueError: a parameter is too large for that.
     """
-    path = run / FOLDER / f"{snapshot.updates:08d}{SUFFIX}"
-    path.parent.mkdir(parents=True, exist_ok=True)
     arrays = traverse_util.flatten_dict(jax.device_get(snapshot.weights), sep="/")
     if half:
         if any(abs(array).max(initial=0) > np.finfo(np.float16).max for array in arrays.values()):
-            raise ValueError(f"{run}: a parameter does not fit into float16")
+            raise ValueError(f"{path}: a parameter does not fit into float16")
         arrays = {name: array.astype(np.float16) for name, array in arrays.items()}
     where = {name: getattr(snapshot, name) for name in _WHERE} | {"format": FORMAT}
     content: dict[str, Any] = arrays | {f"@{name}": np.array(v) for name, v in where.items()}
     with files.replacing(path) as fresh, fresh.open("wb") as file:
         np.savez(file, **content)
-    return path
 
 
 def read(path: Path) -> Snapshot:
@@ -122,11 +129,6 @@ def checksums(path: Path) -> list[tuple[str, int]]:
 def points(run: Path) -> list[Path]:
     """The files of a run's history, oldest first."""
     return sorted(path for path in (run / FOLDER).glob(f"*{SUFFIX}") if path.stem.isdecimal())
-
-
-def newest(run: Path) -> Path | None:
-    """The file of the last point, if there is one."""
-    return next(reversed(points(run)), None)
 
 
 def drop_after(run: Path, updates: int) -> None:

@@ -210,6 +210,9 @@ def update_cost(
     memory: Any = compiled.memory_analysis()
     cost: Any = compiled.cost_analysis() or {}  # not every backend counts
 
+    def per_step(name: str, unit: float) -> float | None:
+        return round(cost[name] / count / unit, 2) if name in cost else None
+
     def call() -> Any:
         nonlocal state
         state, metrics = compiled(state, share, words, params)
@@ -220,8 +223,8 @@ def update_cost(
         "environments": count,
         "compile_seconds": round(compile_seconds, 2),
         "steps_per_second": round(count * config.rollout_steps * updates / seconds),
-        "megaflop_per_step_compiled": round(cost.get("flops", 0) / count / 1e6, 2),
-        "kilobytes_per_step_compiled": round(cost.get("bytes accessed", 0) / count / 1e3, 1),
+        "megaflop_per_step_compiled": per_step("flops", 1e6),
+        "kilobytes_per_step_compiled": per_step("bytes accessed", 1e3),
         "arguments_mb": round(memory.argument_size_in_bytes / 1e6, 1),
         "temporary_mb": round(memory.temp_size_in_bytes / 1e6, 1),
     }

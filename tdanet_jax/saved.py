@@ -17,7 +17,7 @@ import numpy as np
 
 from tdanet_jax import classes, comparison, episodes, evaluation, history, policies, report
 from tdanet_jax import config as configs
-from tdanet_jax.checkpoint import Checkpoints, newest
+from tdanet_jax.checkpoint import Checkpoints, is_passed_on, newest
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.episodes import Episodes
 from tdanet_jax.evaluation import Records
@@ -109,7 +109,7 @@ def find(run: Path, with_history: bool = False, data: str | None = None) -> list
         if not points:
             raise ValueError(f"{run / history.FOLDER}: no history; train with --history above 0")
         return [Saved(run, config, point, data) for point in points]
-    if Checkpoints(run).latest() is None and history.newest(run) is None:
+    if not is_passed_on(run) and Checkpoints(run).latest() is None:
         raise ValueError(f"{run}: no checkpoint")
     return [Saved(run, config, None, data)]
 
@@ -124,7 +124,8 @@ def share(run: Path, out: Path) -> None:
       ValueError: the folder holds no run, or its network cannot be read or does not fit.
     """
     network = find(run)[0]
-    history.write(out, network.load(), half=True)
+    out.mkdir(parents=True, exist_ok=True)
+    history.save(out / history.NETWORK, network.load(), half=True)
     configs.save(network.config, out / CONFIG_FILE)
     classes.load(run).save(out)
     for name in (report.RESULTS_PAGE, report.EPISODES_FILE, report.RESULTS_FILE):

@@ -1,5 +1,6 @@
 """One update on eight devices is the update on one; what cannot be laid out is refused."""
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import pytest
 
 from tdanet_jax import devices, learner
-from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.config import PRESETS, TrainConfig
 from tdanet_jax.task import make_task
 
 #: In a process of its own, which alone can split its CPU into eight devices.
@@ -32,7 +33,8 @@ for over in (Mesh(np.array(jax.devices()[:1]), (devices.AXIS,)), mesh):
     chunk = learner.make_train(config, MODEL, 1, (layout, devices.everywhere(over)))
     chunk = chunk.lower(state, jax.numpy.zeros(2), words, params).compile()
     # Devices add up their gradients. What each has seen stays where it is.
-    assert "all-gather" not in chunk.as_text()
+    exchanges = ("all-gather", "all-to-all", "collective-permute")
+    assert not [name for name in exchanges if name in chunk.as_text()]
     assert ("all-reduce" in chunk.as_text()) == (over.size > 1)
     after, metrics = chunk(state, jax.numpy.zeros(2), words, params)
     assert {len(x.sharding.device_set) for x in jax.tree.leaves(after)} == {over.size}
@@ -78,12 +80,16 @@ def test_a_process_on_its_own_agrees_with_itself():
     assert not devices.anywhere(False)
 
 
-@pytest.mark.parametrize("model", ["tdanet", "mjolnir-r", "savn"])
-def test_an_update_can_be_lowered_for_a_gpu(some_rooms, glove, model, monkeypatch):
+@pytest.mark.parametrize(
+    ("model", "preset"),
+    [("tdanet", "default"), ("tdanet", "best"), ("mjolnir-r", "default"), ("savn", "default")],
+)
+def test_an_update_can_be_lowered_for_a_gpu(some_rooms, glove, model, preset, monkeypatch):
     # Not what it computes there, which needs one: that no part of it exists on CPUs alone.
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    learning = LearnerConfig(num_envs=4, rollout_steps=6)
-    network = NetworkConfig(precision="bfloat16")
+    base = PRESETS[preset]
+    learning = dataclasses.replace(base.learner, num_envs=4, rollout_steps=6)
+    network = dataclasses.replace(base.network, precision="bfloat16")
     config = TrainConfig(model=model, network=network, learner=learning)
     task = make_task(config, some_rooms, glove)
     arguments = task.train_words, task.train_params

@@ -51,7 +51,7 @@ def test_a_parameter_that_does_not_fit_is_one_clear_error(
     snapshot = newest(opinionated_run)
     snapshot.weights["actor"]["bias"] = np.full(6, 1e6, np.float32)
     with pytest.raises(ValueError, match="a parameter does not fit into float16"):
-        history.write(tmp_path, snapshot, half=True)
+        history.save(tmp_path / "network.npz", snapshot, half=True)
 
 
 def test_the_agent_of_the_project_plays_in_the_rooms_of_the_project(ithor: SceneTables) -> None:

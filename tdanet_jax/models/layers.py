@@ -45,7 +45,8 @@ def _dot_rows(a: jax.Array, b: jax.Array, dtype: Any) -> jax.Array:
     """The sum over rows of a [..., n] times b [..., m], [n, m]; as `_dot`.
 
     Time and environments stay axes of their own: as one, devices that share the environments would
-    have to exchange them all. On a processor step by step, whose operands its caches hold.
+    have to exchange them all. On a processor one after the other along the first axis, commonly
+    time: the operands of a step fit its caches.
     """
 
     def over_rows(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -55,7 +56,7 @@ def _dot_rows(a: jax.Array, b: jax.Array, dtype: Any) -> jax.Array:
             a, b, ((rows, rows), ((), ())), preferred_element_type=jnp.float32
         )
 
-    if a.ndim == 2 or jax.default_backend() != "cpu":
+    if a.ndim <= 2 or jax.default_backend() != "cpu":
         return over_rows(a, b)
 
     def add(total: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:

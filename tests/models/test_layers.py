@@ -34,7 +34,7 @@ def normal(*shape: int, seed: int = 0) -> jax.Array:
     return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
 
 
-@pytest.mark.parametrize("lead", [(6,), (2, 6), (2, 3, 2)])
+@pytest.mark.parametrize("lead", [(), (6,), (2, 6), (2, 3, 2)])
 def test_product_is_a_matrix_product_with_the_plain_gradient(
     lead: tuple[int, ...], backend: None
 ) -> None:
