@@ -139,8 +139,8 @@ FAULTS = (
           "nn.softmax(logits, axis=-1)", TEST_TDANET),
     Fault("empty frame has a word", TDANET, "jnp.where(obs.mask, weights, 0.0)", "weights",
           TEST_TDANET),
-    Fault("difference without its absolute", TDANET, "jnp.abs(features - table",
-          "(features - table", TEST_TDANET),
+    Fault("difference without its absolute", TDANET, "jnp.abs(features - look_up",
+          "(features - look_up", TEST_TDANET),
     Fault("boxes without attention", TDANET, "weights, obs.boxes)", "1.0 * obs.mask, obs.boxes)",
           TEST_TDANET),
     Fault("dropout without scale", TDANET, "features / (1 - self.dropout)", "features",
@@ -236,6 +236,22 @@ FAULTS = (
           "test_learner.py"),
     Fault("the last call's product for all", "models/layers.py",
           "(y, transposed) if once else ()", "(y, transposed)", "models/test_layers.py"),
+    Fault("the last step's kernel gradient", "models/layers.py",
+          "return total + over_rows(*step), None", "return over_rows(*step), None",
+          "models/test_layers.py"),
+    Fault("another column on GPUs", "models/layers.py", "one_hot(column, table.shape[1])",
+          "one_hot(column + 1, table.shape[1])", "models/test_layers.py"),
+    Fault("GPUs add in any order", "models/layers.py",
+          'if jax.default_backend() == "cpu":\n        return table[index]',
+          "if True:\n        return table[index]", "test_devices.py"),
+    Fault("devices exchange their rollouts", "models/layers.py",
+          "if a.ndim <= 2 or jax.default_backend()",
+          "a, b = a.reshape(-1, a.shape[-1]), b.reshape(-1, b.shape[-1])\n"
+          "    if a.ndim <= 2 or jax.default_backend()", "test_devices.py"),
+    Fault("all seeds become the first", "training.py", "lambda x, i=i: x[i]", "lambda x, i=i: x[0]",
+          "test_training.py"),
+    Fault("an agent that was passed on is trained over", "checkpoint.py",
+          "return (run / history.NETWORK).exists()", "return False", "test_share.py"),
     Fault("a stranger's model is imported", "config.py", "if config.model not in trusted:",
           "if not config.model:", "test_config.py"),
     Fault("the last of several budgets", "config.py", "max(done[name]", "min(done[name]",
@@ -270,7 +286,7 @@ def passes(root: Path, tests: str) -> bool:
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the repository; the tests in it see its own package."""
     root = tmp_path_factory.mktemp("copy")
-    for name in ("tdanet_jax", "tests", "experiments", "assets"):
+    for name in ("tdanet_jax", "tests", "experiments", "assets", "agents"):
         shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", root)
     return root
