@@ -21,10 +21,10 @@ from experiments.console import console, fail, one_line_errors, parse
 from experiments.one_episode import Choice
 
 if TYPE_CHECKING:
-    from tdanet_jax.episodes import Episodes
-    from tdanet_jax.evaluation import Records
+    from tdanet_jax.analysis.trace import Player, Trace
+    from tdanet_jax.evaluation.episodes import Episodes
+    from tdanet_jax.evaluation.rollout import Records
     from tdanet_jax.scenes import SceneTables
-    from tdanet_jax.trace import Player, Trace
 
 Played = Mapping[str, tuple["Episodes", "Records"]]
 
@@ -51,7 +51,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 def show(command: Command) -> None:
     """Plays, and writes the tables and pictures."""
-    from tdanet_jax import devices, files, pictures
+    from tdanet_jax.analysis import pictures
+    from tdanet_jax.io import files
+    from tdanet_jax.training import devices
 
     devices.keep_compiled()
     choice, out = command.choice, command.out or default_folder(command)
@@ -89,19 +91,20 @@ def default_folder(command: Command) -> Path:
 
 def play_lists(player: Player, tables: SceneTables, seed: int) -> Played:
     """The player's records of the fixed test episodes."""
-    from tdanet_jax import episodes, evaluation
+    from tdanet_jax.evaluation import episodes, rollout
 
     lists = episodes.load(tables, player.task.split, player.task.extras)
     console.print(f"playing {sum(map(len, lists.values())):,} test episodes ...")
     params = player.task.eval_params
-    return evaluation.evaluate_lists(player.policy, player.weights, params, lists, seed)
+    return rollout.evaluate_lists(player.policy, player.weights, params, lists, seed)
 
 
 def write_pairs(player: Player, tables: SceneTables, played: Played, out: Path) -> None:
     """Writes the mean attention by class pair as a table, a page and a picture."""
     import numpy as np
 
-    from tdanet_jax import attention, files, pictures, trace
+    from tdanet_jax.analysis import attention, pictures, trace
+    from tdanet_jax.io import files
 
     assert player.model is not None
     task = player.task
@@ -133,8 +136,8 @@ def example(player: Player, tables: SceneTables, played: Played) -> Trace:
     """An episode to show: the first success with L >= 5, unseen targets first; else the first."""
     import numpy as np
 
-    from tdanet_jax import trace
-    from tdanet_jax.episodes import Episodes
+    from tdanet_jax.analysis import trace
+    from tdanet_jax.evaluation.episodes import Episodes
 
     for wanted in (5, 1, 0):
         for chosen, records in reversed(list(played.values())):

@@ -25,8 +25,8 @@ from experiments.console import check_positive, console, fail, one_line_errors, 
 from tdanet_jax.config import NetworkConfig, TrainConfig
 
 if TYPE_CHECKING:
-    from tdanet_jax.measure import Row
     from tdanet_jax.task import Task
+    from tdanet_jax.tools.benchmarking import Row
 
 Part = Literal[
     "tables", "import", "startup", "machine", "environment", "rollout", "update", "evaluation",
@@ -90,9 +90,11 @@ def main(arguments: list[str] | None = None) -> None:
         if command.odometry and not {"rollout", "update", "decision"} & set(command.parts):
             fail("--odometry: none of the --parts has a model; choose rollout, update or decision")
         if command.checkpoint is not None:
-            from tdanet_jax import saved
+            from tdanet_jax.evaluation import saved_networks
 
-            saved.find(command.checkpoint)  # what is not there is noticed now, not after minutes
+            saved_networks.find(
+                command.checkpoint
+            )  # what is not there is noticed now, not after minutes
         rows = []
         with contextlib.nullcontext() if command.out is None else command.out.open("x") as file:
             for row in figures(command):
@@ -109,14 +111,15 @@ def figures(command: Command) -> Iterator[Row]:
     """All figures that were asked for, one row each."""
     import jax
 
-    from tdanet_jax import devices, measure
     from tdanet_jax.task import load_task
+    from tdanet_jax.tools import benchmarking
+    from tdanet_jax.training import devices
 
     mesh = devices.connect(command.devices)
     yield {
         "part": "start",
         "device": str(jax.devices()[0]),
-        "processor": measure.processor(),
+        "processor": benchmarking.processor(),
         "jax": jax.__version__,
     }
     if "tables" in command.parts:
@@ -128,16 +131,16 @@ def figures(command: Command) -> Iterator[Row]:
         yield startup_row()
     peak = None
     if "machine" in command.parts:
-        machine = measure.machine_row(command.repeats)
+        machine = benchmarking.machine_row(command.repeats)
         peak = machine["float32_gflops"]
         yield machine
     if "environment" in command.parts:
         for count in command.environments:
             for observed in (False, True):
-                yield measure.environment_row(task, count, observed, command.repeats, mesh)
+                yield benchmarking.environment_row(task, count, observed, command.repeats, mesh)
     if "evaluation" in command.parts:
         for networks in command.networks:
-            yield measure.evaluation_row(command.checkpoint, task, networks, command.repeats)
+            yield benchmarking.evaluation_row(command.checkpoint, task, networks, command.repeats)
     for name in command.models:
         for row in model_rows(command, name, peak):
             senses = {"odometry": command.odometry, "triangulation": command.triangulation}
@@ -152,8 +155,8 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
     """
     import jax.numpy as jnp
 
-    from tdanet_jax import measure
     from tdanet_jax.task import load_task
+    from tdanet_jax.tools import benchmarking
 
     acts = {"rollout", "update"} & set(command.parts)
     measured = set()
@@ -166,15 +169,18 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
         measured.add(precision)
         for count in command.batches:
             if "rollout" in command.parts:
-                yield {**measure.rollout_row(task, count, command.repeats), "precision": precision}
+                yield {
+                    **benchmarking.rollout_row(task, count, command.repeats),
+                    "precision": precision,
+                }
             if "update" in command.parts:
-                row = measure.update_row(task, count, command.repeats)
-                share = measure.share_of_peak(task, row, peak) if name == "tdanet" else {}
+                row = benchmarking.update_row(task, count, command.repeats)
+                share = benchmarking.share_of_peak(task, row, peak) if name == "tdanet" else {}
                 yield {**row, **share, "precision": precision}
     if "decision" in command.parts:
         task = load_task(TrainConfig(model=name, network=command.network, data=command.data))
         for count in (1, 1024):
-            yield measure.decision_row(task, count, command.repeats)
+            yield benchmarking.decision_row(task, count, command.repeats)
 
 
 def tables_row() -> Row:

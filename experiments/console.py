@@ -31,7 +31,7 @@ from rich.progress import (
 from rich.text import Text
 
 import experiments
-from tdanet_jax.files import LOCK_FILE, PARTIAL
+from tdanet_jax.io.files import LOCK_FILE, PARTIAL
 from tdanet_jax.vocabulary import GROUPS
 
 Arguments = TypeVar("Arguments")
@@ -118,7 +118,7 @@ def check_new_file(path: Path, in_folder: bool = True) -> None:
 
 def check_picture(out: Path) -> None:
     """Fails unless --out ends in a format that pictures can be written in."""
-    from tdanet_jax import pictures
+    from tdanet_jax.analysis import pictures
 
     if out.suffix[1:] not in pictures.formats():
         fail(f"--out {out}: end it in one of .{', .'.join(pictures.formats())}")
@@ -334,7 +334,7 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
 
 def print_summary(results: Mapping[str, Any]) -> None:
     """One line per group: seen targets, 1000 episodes: SR 75.1 (70.2 to 80.0), SPL ..."""
-    from tdanet_jax.metrics import shown
+    from tdanet_jax.evaluation.metrics import shown
 
     for group in GROUPS:
         if results[group] is None:

@@ -31,7 +31,7 @@ from experiments.console import (
 from tdanet_jax.config import TrainConfig
 
 if TYPE_CHECKING:
-    from tdanet_jax.saved import Saved
+    from tdanet_jax.evaluation.saved_networks import Saved
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,14 +88,17 @@ def main(arguments: list[str] | None = None) -> None:
         untrained_config(command).check()
         folder = command.out or default_folder(command)
         check_empty(folder)
-        from tdanet_jax import devices, saved
+        from tdanet_jax.evaluation import saved_networks
+        from tdanet_jax.training import devices
 
         devices.keep_compiled()
         if not trained:
             evaluate_untrained(command, folder)
             return
         networks = [
-            n for run in command.checkpoint for n in saved.find(run, command.history, command.data)
+            n
+            for run in command.checkpoint
+            for n in saved_networks.find(run, command.history, command.data)
         ]
         if command.history or len(networks) > 1:
             evaluate_several(command, networks, folder)
@@ -124,14 +127,14 @@ def untrained_config(command: Command) -> TrainConfig:
 
 def evaluate_untrained(command: Command, folder: Path) -> None:
     """Random or the shortest path."""
-    from tdanet_jax import episodes, evaluation, policies, report
+    from tdanet_jax.evaluation import episodes, policies, report, rollout
     from tdanet_jax.task import load_task
 
     config = untrained_config(command)
     task = load_task(config)
     lists = episodes.load(task.tables, task.split, task.extras)
     make = {"random": policies.random, "shortest_path": policies.shortest_path}[command.policy]
-    played = evaluation.evaluate_lists(make(), None, task.eval_params, lists, config.seed)
+    played = rollout.evaluate_lists(make(), None, task.eval_params, lists, config.seed)
     provenance = report.Provenance(
         split=task.split.name,
         model=command.policy,
@@ -150,9 +153,9 @@ def evaluate_untrained(command: Command, folder: Path) -> None:
 
 def evaluate_one(command: Command, network: Saved, folder: Path) -> None:
     """The newest checkpoint of one run."""
-    from tdanet_jax import report, saved
+    from tdanet_jax.evaluation import report, saved_networks
 
-    done = next(saved.evaluate([network], command.policy == "greedy", command.seed))
+    done = next(saved_networks.evaluate([network], command.policy == "greedy", command.seed))
     folder.mkdir(parents=True, exist_ok=True)
     print_summary(report.write(folder, done.provenance, done.task.tables, done.played))
     console.print(f"wrote {folder / report.RESULTS_PAGE}")
@@ -160,12 +163,14 @@ def evaluate_one(command: Command, network: Saved, folder: Path) -> None:
 
 def evaluate_several(command: Command, networks: Sequence[Saved], folder: Path) -> None:
     """Several runs, or the history of one or more."""
-    from tdanet_jax import comparison, figures, files, report, saved
+    from tdanet_jax.analysis import figures
+    from tdanet_jax.evaluation import comparison, report, saved_networks
+    from tdanet_jax.io import files
 
     results, records, played = {}, [], {}
     greedy = command.policy == "greedy"
     with reporter("evaluating") as show:
-        for done in saved.evaluate(networks, greedy, command.seed):
+        for done in saved_networks.evaluate(networks, greedy, command.seed):
             results[done.saved] = done.results()
             if not command.history:
                 played[done.saved] = done.columns()

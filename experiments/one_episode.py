@@ -15,10 +15,10 @@ from tdanet_jax.config import CONFIG_FILE
 if TYPE_CHECKING:
     import numpy as np
 
-    from tdanet_jax.episodes import Episodes
+    from tdanet_jax.analysis.trace import Player, Trace
+    from tdanet_jax.evaluation.episodes import Episodes
     from tdanet_jax.scenes import SceneTables
     from tdanet_jax.scenes.dataset import Rooms
-    from tdanet_jax.trace import Player, Trace
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +90,7 @@ def load_rooms(choice: Choice, runs: Sequence[Path]) -> Rooms:
 
 def load_players(runs: Sequence[Path], rooms: Rooms, policy: str) -> list[Player]:
     """The agents of some runs, each with a name of its own."""
-    from tdanet_jax import trace
+    from tdanet_jax.analysis import trace
 
     players = [trace.load_player(run, rooms, policy == "greedy") for run in runs]
     names = [player.name for player in players]
@@ -105,7 +105,7 @@ Chosen = tuple["Episodes", "np.ndarray | None"]
 
 def choose(choice: Choice, runs: Sequence[Path], tables: SceneTables) -> Chosen:
     """The episode that the flags mean, and the actions of runs[0] if it is a recorded one."""
-    from tdanet_jax import episode_lookup
+    from tdanet_jax.analysis import episode_lookup
 
     if choice.episode is not None:
         return episode_lookup.read_record(folder_of(runs[0]), choice.episode, tables)
@@ -117,7 +117,7 @@ def choose(choice: Choice, runs: Sequence[Path], tables: SceneTables) -> Chosen:
 
 def play(chosen: Chosen, players: Sequence[Player], tables: SceneTables, seed: int) -> list[Trace]:
     """Each player's trace of the episode; players[0] is the agent of runs[0]."""
-    from tdanet_jax import trace
+    from tdanet_jax.analysis import trace
 
     episode, actions = chosen
     if actions is None:
@@ -128,7 +128,7 @@ def play(chosen: Chosen, players: Sequence[Player], tables: SceneTables, seed: i
 
 def play_runs(choice: Choice, runs: Sequence[Path], rooms: Rooms, shortest: bool) -> list[Trace]:
     """The chosen episode, played by the agents of some runs and, if asked for, on the best way."""
-    from tdanet_jax import trace
+    from tdanet_jax.analysis import trace
 
     chosen = choose(choice, runs, rooms.tables)
     players = load_players(runs, rooms, choice.policy)

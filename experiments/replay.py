@@ -41,7 +41,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 def write(command: Command) -> None:
     """Plays the episode and writes the page."""
-    from tdanet_jax import devices, files, replay
+    from tdanet_jax.analysis import replay
+    from tdanet_jax.io import files
+    from tdanet_jax.training import devices
 
     devices.keep_compiled()
     choice, runs = command.choice, command.checkpoint

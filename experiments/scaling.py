@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     import jax
     import numpy as np
 
-    from tdanet_jax.env import EnvParams
-    from tdanet_jax.measure import Row
+    from tdanet_jax.env.dynamics import EnvParams
     from tdanet_jax.scenes import SceneTables
     from tdanet_jax.task import Task
+    from tdanet_jax.tools.benchmarking import Row
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +70,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 def scale(command: Command) -> None:
     """Measures every size and writes the figures and the plot."""
-    from tdanet_jax import figures, scenes, words
+    from tdanet_jax import scenes, words
+    from tdanet_jax.analysis import figures
     from tdanet_jax.task import make_task
 
     task = make_task(TrainConfig(), scenes.load_tables(), words.load_bundled())
@@ -93,7 +94,7 @@ def measure(command: Command, task: Task) -> Iterator[Row]:
     import jax.numpy as jnp
 
     from tdanet_jax.config import LearnerConfig
-    from tdanet_jax.measure import update_cost
+    from tdanet_jax.tools.benchmarking import update_cost
 
     count = LearnerConfig().num_envs
     model, words, params = task.model, task.train_words, task.train_params
@@ -122,8 +123,8 @@ def with_rooms(task: Task, count: int) -> EnvParams:
     """The environment of `count` training rooms: some of them, or all of them several times."""
     import numpy as np
 
-    from tdanet_jax import env
-    from tdanet_jax.reward import Parents
+    from tdanet_jax.env import dynamics
+    from tdanet_jax.env.reward import Parents
 
     names = task.split.train_scenes
     per_type = len(names) // 4
@@ -136,7 +137,9 @@ def with_rooms(task: Task, count: int) -> EnvParams:
     old = task.train_params
     parents = Parents(np.asarray(old.parent_class), np.asarray(old.parent_reward))
     tables = joined(parts)
-    return env.make_params(tables, task.split.seen, parents, old.step_limit.tolist(), merge=False)
+    return dynamics.make_params(
+        tables, task.split.seen, parents, old.step_limit.tolist(), merge=False
+    )
 
 
 def joined(parts: list[SceneTables]) -> SceneTables:

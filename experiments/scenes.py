@@ -32,7 +32,7 @@ from experiments.console import (
     one_line_usage,
     reporter,
 )
-from tdanet_jax import files
+from tdanet_jax.io import files
 from tdanet_jax.scenes.scene import GRID
 from tdanet_jax.vocabulary import (
     ALL_TARGETS,
@@ -58,9 +58,9 @@ class Build:
 
     def run(self) -> None:
         """Writes the files and says which."""
-        from tdanet_jax import bundle
+        from tdanet_jax.tools import build_assets
 
-        for path in bundle.build(self.out, self.wheels):
+        for path in build_assets.build(self.out, self.wheels):
             console.print(f"{path}  {path.stat().st_size:,} bytes")
 
 
@@ -78,8 +78,8 @@ class Verify:
     def run(self) -> None:
         """Prints the tables."""
         check_positive(rooms=self.rooms, views=self.views, worst=self.worst)
+        from tdanet_jax.poses import VIEWS
         from tdanet_jax.scenes import ithor
-        from tdanet_jax.scenes.poses import VIEWS
 
         start = time.monotonic()
         rooms = ithor.load_scenes()
@@ -107,9 +107,9 @@ def _bundled() -> SceneTables:
 
 def flag_lines(train: list[Scene], test: list[Scene], worst: int) -> Iterator[str]:
     """Agreement with AI2-THOR's `visible` flags in the default frames, as lines of a table."""
-    from tdanet_jax.reward import PARENT_CANDIDATES
-    from tdanet_jax.scenes.agreement import Count, by_class
-    from tdanet_jax.scenes.rules import RULES
+    from tdanet_jax.env.reward import PARENT_CANDIDATES
+    from tdanet_jax.scenes.checks.agreement import Count, by_class
+    from tdanet_jax.scenes.visibility.rules import RULES
 
     columns = [by_class(rooms, RULES) for rooms in (train, test)]
 
@@ -142,9 +142,9 @@ def flag_lines(train: list[Scene], test: list[Scene], worst: int) -> Iterator[st
 
 def box_line(rooms: list[Scene], count: int, views: int) -> str:
     """Agreement of the boxes with dense ray casting on the same solids."""
-    from tdanet_jax.scenes.agreement import Count, compare_boxes
-    from tdanet_jax.scenes.poses import VIEWS
-    from tdanet_jax.scenes.rules import RULES
+    from tdanet_jax.poses import VIEWS
+    from tdanet_jax.scenes.checks.agreement import Count, compare_boxes
+    from tdanet_jax.scenes.visibility.rules import RULES
 
     draw = np.random.default_rng(0)
     overlaps: list[float] = []
@@ -164,7 +164,7 @@ def box_line(rooms: list[Scene], count: int, views: int) -> str:
 
 def print_survey(tables: SceneTables) -> None:
     """Prints the size of the tables and what in them is out of reach."""
-    from tdanet_jax.scenes import survey
+    from tdanet_jax.scenes.checks import survey
 
     console.print(
         f"{len(tables.scenes)} rooms, {len(tables.position):,} positions, "
@@ -205,7 +205,7 @@ class Inspect:
 
     def run(self) -> None:
         """Writes the picture and lists the view."""
-        from tdanet_jax.scenes import picture
+        from tdanet_jax.analysis import room_picture
 
         check_picture(self.out)
         if self.position is None and (self.rotation or self.horizon):
@@ -214,10 +214,10 @@ class Inspect:
             fail(f"--position {self.position[0]} {self.position[1]}: must be finite")
         room, tables = self._room()
         if self.position is None:
-            state = picture.most_telling_state(tables)
+            state = room_picture.most_telling_state(tables)
         else:
             state = tables.nearest_state(0, *self.position, self.rotation, self.horizon)
-        picture.draw(room, tables, state, self.out)
+        room_picture.draw(room, tables, state, self.out)
         console.print(f"{self.out}")
 
     def _room(self) -> tuple[Scene, SceneTables]:
@@ -239,7 +239,7 @@ class Inspect:
         return room, scene_tables.build([room])
 
     def _check(self, names: Sequence[str]) -> None:
-        from tdanet_jax.episode_lookup import name_ranges
+        from tdanet_jax.analysis.episode_lookup import name_ranges
 
         if self.scene not in names:
             fail(f"{self.scene}: no such room; there are {name_ranges(names)}")
@@ -396,7 +396,7 @@ class Export:
     def run(self) -> None:
         """Writes the folder."""
         from tdanet_jax import words
-        from tdanet_jax.reward import named_parents
+        from tdanet_jax.env.reward import named_parents
         from tdanet_jax.scenes import dataset
         from tdanet_jax.scenes.offline import exporter
 

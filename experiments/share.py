@@ -30,9 +30,9 @@ def main(arguments: list[str] | None = None) -> None:
     command = parse(Command, arguments, prog="share", description=__doc__)
     with one_line_errors():
         check_empty(command.out)
-        from tdanet_jax import saved
+        from tdanet_jax.evaluation import saved_networks
 
-        saved.share(command.checkpoint, command.out)
+        saved_networks.share(command.checkpoint, command.out)
         size = sum(path.stat().st_size for path in command.out.rglob("*") if path.is_file())
         console.print(f"{size / 1e6:.1f} MB in {command.out}")
 

@@ -33,14 +33,14 @@ from experiments.console import (
     stoppable,
 )
 from experiments.train_zero_shot import figures_of, parse_command, prepare, report_on, title, train
-from tdanet_jax import sweep, sweep_report
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
-from tdanet_jax.sweep import Finished
-from tdanet_jax.sweep_report import Cost
+from tdanet_jax.evaluation import sweep, sweep_report
+from tdanet_jax.evaluation.sweep import Finished
+from tdanet_jax.evaluation.sweep_report import Cost
 from tdanet_jax.vocabulary import file_name
 
 if TYPE_CHECKING:
-    from tdanet_jax.training import Run
+    from tdanet_jax.training.run import Run
 
 #: Batches whose inference time is reported.
 BATCHES = (1, 1024)
@@ -126,9 +126,9 @@ def train_all(
       training: the flags of the training command.
       configs: what to train.
     """
-    from tdanet_jax import devices
-    from tdanet_jax.classes import Classes
+    from tdanet_jax.models.classes import Classes
     from tdanet_jax.task import make_model, resolve
+    from tdanet_jax.training import devices
 
     devices.connect(training.devices)
     devices.keep_compiled()
@@ -159,9 +159,10 @@ def train_all(
 
 def train_together(members: Sequence[tuple[TrainConfig, Path]]) -> None:
     """Trains seeds of one split and model in one vmapped call, then reports on each."""
-    from tdanet_jax import episodes, files
+    from tdanet_jax.evaluation import episodes
+    from tdanet_jax.io import files
     from tdanet_jax.task import load_task
-    from tdanet_jax.training import Run
+    from tdanet_jax.training.run import Run
 
     with stoppable(lambda: "every seed is saved") as stop, contextlib.ExitStack() as locks:
         with reporter("rooms", transient=True) as show:
@@ -180,7 +181,7 @@ def train_together(members: Sequence[tuple[TrainConfig, Path]]) -> None:
 
 def learn_together(runs: Sequence[Run], stop: StopRequest) -> None:
     """Trains all to the end of the budget or to a signal, and saves."""
-    from tdanet_jax.training import chunks_together
+    from tdanet_jax.training.run import chunks_together
 
     def save() -> float:
         for run in runs:
@@ -202,7 +203,7 @@ def learn_together(runs: Sequence[Run], stop: StopRequest) -> None:
 @contextlib.contextmanager
 def alone(out: Path) -> Iterator[None]:
     """Inside, no other process reports in `out`; waits for one that does."""
-    from tdanet_jax import files
+    from tdanet_jax.io import files
 
     with contextlib.ExitStack() as locks:
         try:
@@ -215,7 +216,10 @@ def alone(out: Path) -> Iterator[None]:
 
 def write_report(out: Path, included: Sequence[Finished]) -> None:
     """Evaluates what is missing, and writes the report on the runs in `out` and on others."""
-    from tdanet_jax import figures, files, measure, report
+    from tdanet_jax.analysis import figures
+    from tdanet_jax.evaluation import report
+    from tdanet_jax.io import files
+    from tdanet_jax.tools import benchmarking
 
     if not (sweep.find(out) or included):
         fail(f"{out}: no finished run")
@@ -234,7 +238,7 @@ def write_report(out: Path, included: Sequence[Finished]) -> None:
             untrained=sweep.untrained(runs, UNTRAINED_SEED),
             costs=costs(runs),
             curves=curves,
-            machine=measure.processor(),
+            machine=benchmarking.processor(),
             code=report.code_version(),
         )
         names = {split: f"learning_curve-{file_name(split)}.png" for split in curves}
@@ -260,8 +264,8 @@ def check_alike(runs: Sequence[Finished], planned: Sequence[Path] = ()) -> None:
 
 def costs(runs: Sequence[Finished]) -> dict[str, Cost]:
     """Parameters and inference time of every network among the runs, on this machine, by label."""
-    from tdanet_jax import measure
     from tdanet_jax.task import load_task
+    from tdanet_jax.tools import benchmarking
 
     measured: dict[object, Cost] = {}
     out: dict[str, Cost] = {}
@@ -270,7 +274,7 @@ def costs(runs: Sequence[Finished]) -> dict[str, Cost]:
         network = config.model, config.network, config.data, config.word_vectors
         if network not in measured:
             task = load_task(config)
-            rows = {batch: measure.decision_row(task, batch, repeats=5) for batch in BATCHES}
+            rows = {batch: benchmarking.decision_row(task, batch, repeats=5) for batch in BATCHES}
             measured[network] = Cost(
                 model=config.model,
                 parameters=rows[BATCHES[0]]["parameters"],

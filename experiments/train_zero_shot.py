@@ -39,9 +39,9 @@ from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, PRESETS, TrainConfig, run_name
 
 if TYPE_CHECKING:
-    from tdanet_jax.episodes import Episodes
+    from tdanet_jax.evaluation.episodes import Episodes
     from tdanet_jax.task import Task
-    from tdanet_jax.training import Row, Run
+    from tdanet_jax.training.run import Row, Run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +108,7 @@ def resumed(command: Command) -> TrainConfig:
             "--resume goes on as the run began: beside it, a new budget (--steps, --episodes, "
             "--minutes), --devices and --tensorboard alone"
         )
-    from tdanet_jax.checkpoint import is_passed_on
+    from tdanet_jax.training.checkpoint import is_passed_on
 
     assert folder is not None
     config = configs.load(folder / CONFIG_FILE)
@@ -133,9 +133,11 @@ def default_folder(config: TrainConfig) -> Path:
 def train(config: TrainConfig, folder: Path, command: Command) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
     with stoppable(lambda: how_to_go_on(folder, config.model)) as stop:
-        from tdanet_jax import devices, episodes, files
+        from tdanet_jax.evaluation import episodes
+        from tdanet_jax.io import files
         from tdanet_jax.task import load_task, resolve, without_effect
-        from tdanet_jax.training import Run
+        from tdanet_jax.training import devices
+        from tdanet_jax.training.run import Run
 
         mesh = devices.connect(command.devices)
         devices.keep_compiled()
@@ -162,8 +164,8 @@ def train(config: TrainConfig, folder: Path, command: Command) -> None:
 
 def prepare(folder: Path, config: TrainConfig, task: Task, resume: bool) -> None:
     """What a run finds in its folder when it begins."""
-    from tdanet_jax import files
-    from tdanet_jax.checkpoint import FOLDER
+    from tdanet_jax.io import files
+    from tdanet_jax.training.checkpoint import FOLDER
 
     if not resume:
         check_new(folder)  # again: another process may have begun there meanwhile
@@ -180,7 +182,7 @@ def trust(model: str) -> str:
 
 def how_to_go_on(folder: Path, model: str) -> str:
     """What to say to someone who has stopped a run."""
-    from tdanet_jax.checkpoint import Checkpoints
+    from tdanet_jax.training.checkpoint import Checkpoints
 
     if not (folder / CONFIG_FILE).exists():
         return "the run had not begun"
@@ -190,7 +192,7 @@ def how_to_go_on(folder: Path, model: str) -> str:
 
 def title(run: Run) -> str:
     """tdanet, split 18/4, seed 0; or tdanet, --odometry, ..."""
-    from tdanet_jax.report import agent_name
+    from tdanet_jax.evaluation.report import agent_name
 
     name = agent_name(run.config.model, run.model.odometry, run.model.triangulation)
     return f"{name}, split {run.task.split.name}, seed {run.config.seed}"
@@ -198,7 +200,7 @@ def title(run: Run) -> str:
 
 def learn(run: Run, tensorboard: bool, stop: StopRequest) -> None:
     """Trains to the end of the budget or to a signal in any process, and saves."""
-    from tdanet_jax import devices
+    from tdanet_jax.training import devices
 
     run.save()  # who cannot save learns it before training, not after
     saved = run.seconds
@@ -274,15 +276,16 @@ def report_on(run: Run, lists: Mapping[str, Episodes]) -> None:
     """Evaluates the agent and writes the results and the learning curve."""
     import jax
 
-    from tdanet_jax import evaluation, figures, policies, report
-    from tdanet_jax.training import read_metrics
+    from tdanet_jax.analysis import figures
+    from tdanet_jax.evaluation import policies, report, rollout
+    from tdanet_jax.training.run import read_metrics
 
     figures.learning_curve(read_metrics(run.folder), title(run), run.folder / "learning_curve.png")
     console.print("evaluating ...")
     task, seed = run.task, run.config.seed
     policy = policies.network(run.model, task.words)
     weights = jax.device_get(run.state.params)
-    played = evaluation.evaluate_lists(policy, weights, task.eval_params, lists, seed)
+    played = rollout.evaluate_lists(policy, weights, task.eval_params, lists, seed)
     provenance = report.Provenance(
         split=task.split.name,
         model=run.config.model,

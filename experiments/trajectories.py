@@ -39,8 +39,10 @@ def main(arguments: list[str] | None = None) -> None:
 
 def write(command: Command) -> None:
     """Plays the episode and draws it."""
-    from tdanet_jax import devices, files, pictures
+    from tdanet_jax.analysis import pictures
+    from tdanet_jax.io import files
     from tdanet_jax.scenes import floor_plan
+    from tdanet_jax.training import devices
 
     check_picture(command.out)
     devices.keep_compiled()

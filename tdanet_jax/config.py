@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from tdanet_jax import files
+from tdanet_jax.io import files
 from tdanet_jax.vocabulary import file_name, make_split, split_name
 
 #: Models by name: the module that makes each, and the settings that it is made with.

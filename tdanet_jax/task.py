@@ -11,13 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tdanet_jax import env, graph, zero_shot
+from tdanet_jax import poses
 from tdanet_jax import words as word_vectors
-from tdanet_jax.classes import Classes, make_classes
 from tdanet_jax.config import MODELS, NetworkConfig, TrainConfig
-from tdanet_jax.env import TEST_STEP_LIMITS, EnvParams
-from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.reward import (
+from tdanet_jax.env import dynamics, zero_shot
+from tdanet_jax.env.dynamics import TEST_STEP_LIMITS, EnvParams
+from tdanet_jax.env.reward import (
     Parents,
     cosines,
     find_parents,
@@ -25,7 +24,9 @@ from tdanet_jax.reward import (
     no_parents,
     published_parents,
 )
-from tdanet_jax.scenes import poses
+from tdanet_jax.models import class_graph
+from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.classes import Classes, make_classes
 from tdanet_jax.scenes.dataset import Extras, Rooms, load_rooms, with_own_rooms
 from tdanet_jax.scenes.offline import importer
 from tdanet_jax.scenes.tables import Progress, SceneTables
@@ -142,7 +143,7 @@ def make_task(
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
     adjacency = None if extras is None else extras.class_graph(tables.classes)
     if adjacency is None:
-        adjacency = graph.co_occurrence(seen_rooms)
+        adjacency = class_graph.co_occurrence(seen_rooms)
     classes = make_classes(tables.classes, split.hidden, adjacency)
     model = make_model(config, classes)
     if model.encoder.maps and features is None:
@@ -161,7 +162,7 @@ def make_task(
         split=split,
         classes=classes,
         model=model,
-        train_params=env.make_params(
+        train_params=dynamics.make_params(
             seen_rooms,
             split.seen,
             parents if paid == "parents" else no_parents(seen_rooms),
@@ -173,7 +174,7 @@ def make_task(
             triangulation=model.triangulation,
             size_noise=config.learner.size_noise,
         ),
-        eval_params=env.make_params(
+        eval_params=dynamics.make_params(
             tables,
             targets,
             parents,

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tdanet_jax import assets
-from tdanet_jax.untrusted import FileError, hdf5, npz
+from tdanet_jax.io import assets
+from tdanet_jax.io.untrusted import FileError, hdf5, npz
 from tdanet_jax.vocabulary import class_words
 
 ASSET = "words.npz"

@@ -17,17 +17,18 @@ import pytest
 from hypothesis import settings
 
 from tdanet_jax import config as configs
-from tdanet_jax import episodes, evaluation, policies, report, words
-from tdanet_jax.checkpoint import Checkpoints
+from tdanet_jax import words
 from tdanet_jax.config import CONFIG_FILE, NetworkConfig, TrainConfig
-from tdanet_jax.episodes import Episodes
-from tdanet_jax.learner import TrainState
+from tdanet_jax.evaluation import episodes, policies, report, rollout
+from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.scenes import SceneTables, dataset, load_tables
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.task import Task, make_task
+from tdanet_jax.training.checkpoint import Checkpoints
+from tdanet_jax.training.learner import TrainState
 from tdanet_jax.vocabulary import Action
 from tdanet_jax.words import WordVectors
-from tests.models import samples
+from tests.support import samples
 
 # No deadline: tests do not time anything. Derandomised: the same examples on every run.
 settings.register_profile("tests", deadline=None, derandomize=True, database=None)
@@ -118,7 +119,7 @@ def opinionated_run(
     task, weights = save_untrained(TINY, folder, some_rooms, glove)
     chosen = episodes.draw(some_rooms, task.split.eval_scenes, task.split.seen, 2, seed=0)
     policy = policies.network(task.model, task.words)
-    records = evaluation.evaluate(policy, weights, task.eval_params, chosen, jax.random.key(0))
+    records = rollout.evaluate(policy, weights, task.eval_params, chosen, jax.random.key(0))
     rows = report.episode_rows("seen", report.columns(some_rooms, chosen, records), records)
     (folder / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return folder

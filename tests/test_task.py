@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tdanet_jax import env
-from tdanet_jax.classes import Classes
 from tdanet_jax.config import MODELS, LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.env import dynamics
+from tdanet_jax.models.classes import Classes
 from tdanet_jax.scenes.offline import importer
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.task import make_model, make_task, resolve, without_effect
@@ -52,8 +52,8 @@ def test_each_pose_has_its_own_feature_map_in_training_and_in_tests(
         chosen = np.isin(np.array(tables.scenes), scenes)[tables.position_scene]
         position = np.flatnonzero(chosen)
         poses = jnp.arange(16 * len(position), dtype=jnp.int32)
-        state = jax.vmap(env.start, (None, 0, None))(params, poses, jnp.int32(0))
-        seen = np.asarray(jax.vmap(env.observe, (0, None))(state, params).features)
+        state = jax.vmap(dynamics.start, (None, 0, None))(params, poses, jnp.int32(0))
+        seen = np.asarray(jax.vmap(dynamics.observe, (0, None))(state, params).features)
         assert seen.shape == (len(poses), 49, 2)
         expected = (16 * position[:, None] + np.arange(16)).reshape(-1) % 2048
         np.testing.assert_array_equal(seen[:, :, 0], np.repeat(expected[:, None], 49, 1))
@@ -98,7 +98,7 @@ def test_odometry_and_triangulation_reach_the_network_and_both_environments(
     assert (task.model.odometry, task.model.triangulation) == (senses, sights)
     for params in (task.train_params, task.eval_params):
         assert (params.odometry, params.triangulation) == (senses, sights)
-        obs, state = jax.eval_shape(env.reset, jax.random.key(0), params)
+        obs, state = jax.eval_shape(dynamics.reset, jax.random.key(0), params)
         assert (obs.odometry is not None) == (state.trail is not None) == senses
         if senses:
             assert (obs.odometry.target is not None) == sights

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tdanet_jax import words
+from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes import SceneTables
-from tdanet_jax.untrusted import FileError
 from tdanet_jax.words import WordVectors
 
 SMALL = WordVectors(

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from tdanet_jax.env import FEATURES, RASTER, Observation
+from tdanet_jax.env.dynamics import FEATURES, RASTER, Observation
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import LSTM, TAPE, Carry, Linear
-from tdanet_jax.odometry import numbers, sensed_at_start
+from tdanet_jax.sensors.odometry import numbers, sensed_at_start
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
 #: Units of the layer that reads the odometry.

@@ -10,11 +10,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.env import Observation
+from tdanet_jax.env.dynamics import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.image import ImageEncoder, ImageTable, ImageTrunk, image_alone
+from tdanet_jax.models.classes import Classes
+from tdanet_jax.models.shared.image import ImageEncoder, ImageTable, ImageTrunk, image_alone
 
 
 class BaselineEncoder(ImageEncoder):

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 import jax
 from flax import linen as nn
 
-from tdanet_jax.env import Observation
+from tdanet_jax.env.dynamics import Observation
 
 
 class Encoder(nn.Module, kw_only=True):
@@ -30,7 +30,7 @@ class Encoder(nn.Module, kw_only=True):
         ten units, into the LSTM. "plain": as they are, into the LSTM. "inside": through the same
         layer, into the encoder alone.
       SHARED: names of its layers that no environment adapts for itself, where the network adapts
-        (`tdanet_jax.models.adaptation`).
+        (`tdanet_jax.models.shared.adaptation`).
     """
 
     dropout: float = 0.0
@@ -75,7 +75,7 @@ class Encoder(nn.Module, kw_only=True):
         """What of the observations the encoder uses, in shapes that are the same for all frames.
 
         It says the same of them as of the observations themselves. Only networks that remember
-        frames ask for it (`tdanet_jax.models.adaptation`).
+        frames ask for it (`tdanet_jax.models.shared.adaptation`).
         """
         raise NotImplementedError
 

@@ -4,7 +4,7 @@ Every known class is a node. A node's input is the presence of all classes in th
 per class, and its own word vector; three graph convolutions turn it into five numbers, the node's
 context (present, x, y, S, cosine to the target) joins them, a fourth makes one number of the ten,
 and a linear layer maps those of all nodes to the features. The adjacency starts as the class graph
-(`tdanet_jax.graph`) and is trained, as in the published code.
+(`tdanet_jax.models.class_graph`) and is trained, as in the published code.
 
 MJOLNIR-o adds the context itself. MJOLNIR-r adds in its place the baseline's features of the image,
 in which the previous action probabilities enter; the context enters through the graph alone.
@@ -24,17 +24,15 @@ import numpy as np
 from flax import linen as nn
 from flax import struct
 
-from tdanet_jax import graph
-from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.env import FEATURES, Observation
-from tdanet_jax.models import convolutions
+from tdanet_jax.env.dynamics import FEATURES, Observation
+from tdanet_jax.models import class_graph
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.convolutions import Convolutions
+from tdanet_jax.models.classes import Classes
 from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.image import CHANNELS, ImageEncoder, ImageTable, ImageTrunk
 from tdanet_jax.models.layers import Linear, not_negative
-from tdanet_jax.models.rows import (
+from tdanet_jax.models.shared import graph_convolutions
+from tdanet_jax.models.shared.class_rows import (
     COLUMNS,
     RowTable,
     class_rows,
@@ -42,6 +40,8 @@ from tdanet_jax.models.rows import (
     published_beside,
     rows_alone,
 )
+from tdanet_jax.models.shared.graph_convolutions import Convolutions
+from tdanet_jax.models.shared.image import CHANNELS, ImageEncoder, ImageTable, ImageTrunk
 
 #: Units of a node behind the third convolution.
 NODE_UNITS = 5
@@ -89,7 +89,7 @@ class GraphEncoder(nn.Module):
     dtype: Any = jnp.float32
 
     def setup(self) -> None:
-        start = functools.partial(graph.normalised, self.classes)
+        start = functools.partial(class_graph.normalised, self.classes)
         self.adjacency = self.param("adjacency", lambda _: jnp.asarray(start()))
         self.kernels = [Kernel() for _ in range(3)]
         self.last = self.param("last", not_negative, (NODE_UNITS + COLUMNS, 1))
@@ -118,7 +118,9 @@ class GraphEncoder(nn.Module):
             second=self.kernels[1](width, width),
             third=self.kernels[2](width, NODE_UNITS),
         )
-        nodes = convolutions.apply(self, weights, rows[..., 0] @ table.nodes.presence, self.dtype)
+        nodes = graph_convolutions.apply(
+            self, weights, rows[..., 0] @ table.nodes.presence, self.dtype
+        )
         joined = jnp.concatenate([nodes, rows], axis=-1) @ self.last.astype(jnp.float32)
         return self.mapping(nn.relu(joined[..., 0] @ self.adjacency.astype(jnp.float32).T))
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.models.adaptation import AdaptiveActorCritic
 from tdanet_jax.models.baseline import BaselineEncoder
+from tdanet_jax.models.classes import Classes
+from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
 
 
 def make(config: NetworkConfig, classes: Classes, dtype: Any) -> AdaptiveActorCritic:

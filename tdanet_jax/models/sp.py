@@ -16,15 +16,15 @@ import numpy as np
 from flax import linen as nn
 from flax import struct
 
-from tdanet_jax import graph
-from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.env import Observation
-from tdanet_jax.models import convolutions
+from tdanet_jax.env.dynamics import Observation
+from tdanet_jax.models import class_graph
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.convolutions import Convolutions
-from tdanet_jax.models.image import ImageEncoder, ImageTable, ImageTrunk
+from tdanet_jax.models.classes import Classes
 from tdanet_jax.models.layers import Linear, not_negative
+from tdanet_jax.models.shared import graph_convolutions
+from tdanet_jax.models.shared.graph_convolutions import Convolutions
+from tdanet_jax.models.shared.image import ImageEncoder, ImageTable, ImageTrunk
 
 
 class SceneTable(struct.PyTreeNode):
@@ -88,7 +88,7 @@ class ScenePriorsEncoder(ImageEncoder):
             second=self.kernel1,
             third=self.kernel2,
         )
-        scores = convolutions.apply(self, weights, frame, self.dtype)[..., 0]
+        scores = graph_convolutions.apply(self, weights, frame, self.dtype)[..., 0]
         return jnp.concatenate([image, self.mapping(scores)], axis=-1)
 
 
@@ -96,7 +96,7 @@ def make(config: NetworkConfig, classes: Classes, dtype: Any, width: int = 1024)
     """Scene priors, with `width` units in a node's hidden layers."""
     encoder = ScenePriorsEncoder(
         known=classes.known,
-        adjacency=tuple(map(tuple, graph.normalised(classes).tolist())),
+        adjacency=tuple(map(tuple, class_graph.normalised(classes).tolist())),
         features=config.width,
         width=width,
         dropout=config.dropout,

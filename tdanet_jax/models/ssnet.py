@@ -15,13 +15,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.env import Observation
+from tdanet_jax.env.dynamics import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.classes import Classes
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import recorded
-from tdanet_jax.models.rows import COLUMNS, RowTable, class_rows, make_table, published_beside
+from tdanet_jax.models.shared.class_rows import (
+    COLUMNS,
+    RowTable,
+    class_rows,
+    make_table,
+    published_beside,
+)
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
 #: W_Q and W_K start as this times the unit matrix, W_V as the other, each with a little noise. From

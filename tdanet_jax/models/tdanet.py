@@ -21,10 +21,10 @@ import jax.numpy as jnp
 from flax import linen as nn
 from flax import struct
 
-from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.env import Observation
+from tdanet_jax.env.dynamics import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.classes import Classes
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import Linear, look_up, look_up_in_rows
 

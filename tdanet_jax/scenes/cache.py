@@ -17,7 +17,7 @@ from pathlib import Path
 
 import platformdirs
 
-from tdanet_jax import assets, files
+from tdanet_jax.io import assets, files
 from tdanet_jax.scenes import ithor, tables
 from tdanet_jax.vocabulary import ALL_TARGETS
 
@@ -27,17 +27,17 @@ FORGOTTEN_DAYS = 30
 #: Names of the tables, and of the folders in which imports keep their parts.
 TABLES, IMPORTS = "ithor-", "import-"
 _MODULES = (
-    "archive",
-    "scene",
-    "rules",
+    "io.archive",
     "poses",
-    "geometry",
-    "rays",
-    "solids",
-    "raster",
-    "visibility",
-    "tables",
-    "ithor",
+    "scenes.scene",
+    "scenes.visibility.rules",
+    "scenes.visibility.geometry",
+    "scenes.visibility.rays",
+    "scenes.visibility.solids",
+    "scenes.visibility.raster",
+    "scenes.visibility.build",
+    "scenes.tables",
+    "scenes.ithor",
 )
 
 
@@ -52,7 +52,7 @@ def key() -> str:
     digest = hashlib.sha256(assets.sha256(assets.path(ithor.ASSET)).encode())
     digest.update(repr(ALL_TARGETS).encode())
     for name in _MODULES:
-        module = importlib.import_module(f"tdanet_jax.scenes.{name}")
+        module = importlib.import_module(f"tdanet_jax.{name}")
         digest.update(inspect.getsource(module).encode())
     return digest.hexdigest()[:16]
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from tdanet_jax import files
+from tdanet_jax.io import files
 from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.scene import GRID
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax import files
-from tdanet_jax.scenes import archive, cache
+from tdanet_jax.io import archive, files
+from tdanet_jax.io.untrusted import FileError, npz
+from tdanet_jax.scenes import cache
 from tdanet_jax.scenes.scene import MOST_CLASSES, Scene, SceneObject
 from tdanet_jax.scenes.tables import Progress, SceneTables
-from tdanet_jax.untrusted import FileError, npz
 from tdanet_jax.vocabulary import (
     PARTS,
     ROOM_TYPES,

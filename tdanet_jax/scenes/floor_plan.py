@@ -8,9 +8,9 @@ import numpy as np
 
 from tdanet_jax.scenes import ithor
 from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.geometry import box_frame
 from tdanet_jax.scenes.scene import GRID, Scene
 from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.scenes.visibility.geometry import box_frame
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,13 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax import assets
-from tdanet_jax.scenes import archive
+from tdanet_jax.io import archive, assets
+from tdanet_jax.io.untrusted import npz
 from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.geometry import box_frame, frustum_rotation, lattice
 from tdanet_jax.scenes.metadata import parse_scene
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, GRID, REACH, Scene, SceneObject
-from tdanet_jax.untrusted import npz
+from tdanet_jax.scenes.visibility.geometry import box_frame, frustum_rotation, lattice
 from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
 
 ASSET = "ithor.npz"

@@ -16,15 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax.scenes import archive, poses
+from tdanet_jax import poses
+from tdanet_jax.io import archive
+from tdanet_jax.io.untrusted import npz
+from tdanet_jax.poses import VIEWS
 from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.geometry import action_distances, next_positions, transitions
-from tdanet_jax.scenes.poses import VIEWS
-from tdanet_jax.scenes.raster import paint
-from tdanet_jax.scenes.rules import RULES, Rules
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, MOST_CLASSES, Scene
-from tdanet_jax.scenes.visibility import IMAGE, SUBPIXEL, Sight, look_around
-from tdanet_jax.untrusted import npz
+from tdanet_jax.scenes.visibility.build import IMAGE, SUBPIXEL, Sight, look_around
+from tdanet_jax.scenes.visibility.geometry import action_distances, next_positions, transitions
+from tdanet_jax.scenes.visibility.raster import paint
+from tdanet_jax.scenes.visibility.rules import RULES, Rules
 from tdanet_jax.vocabulary import ALL_TARGETS
 
 FIELD_OF_VIEW = 90.0

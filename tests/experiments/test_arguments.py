@@ -14,7 +14,7 @@ import pytest
 
 from tdanet_jax import config as configs
 from tdanet_jax.config import TrainConfig
-from tests.experiments import command
+from tests.support import command
 
 #: Command -> arguments, typed in a folder made by `folder`, and what the line must contain.
 CASES: dict[str, list[tuple[str, str]]] = {

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import pytest
 
 from experiments import benchmark
-from tdanet_jax import measure
-from tdanet_jax.classes import Classes
 from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.models.classes import Classes
 from tdanet_jax.task import make_model
-from tests.test_agent import OLD_RUN
+from tdanet_jax.tools import benchmarking
+from tests.agent.test_agent import OLD_RUN
 
 
 def test_it_writes_one_json_object_per_figure(ithor, tmp_path):
@@ -90,7 +90,7 @@ def test_the_hand_formula_counts_the_kernels_that_a_step_uses(senses):
     weights = jax.eval_shape(model.initialise, jax.random.key(0), jnp.ones((5, 50)))
     del weights["encoder"]["attention"]
     kernels = sum(leaf.size for leaf in jax.tree.leaves(weights) if leaf.ndim == 2)
-    assert measure.tdanet_forward_macs(model, 50) == kernels
+    assert benchmarking.tdanet_forward_macs(model, 50) == kernels
 
 
 def test_an_evaluation_plays_the_networks_of_a_run_in_one_call(ithor, tmp_path):

@@ -15,13 +15,13 @@ import pytest
 
 import tdanet_jax
 from experiments import evaluate, scenes, train_zero_shot
-from tdanet_jax import files
-from tdanet_jax.agent import Detection
+from tdanet_jax.agent.agent import Detection
+from tdanet_jax.io import files
 from tdanet_jax.scenes import SceneTables, dataset
 from tdanet_jax.scenes.offline import importer
-from tests import original
 from tests.conftest import SOME_ROOMS
-from tests.experiments.command import TINY
+from tests.support import original
+from tests.support.command import TINY
 
 
 @pytest.fixture(autouse=True)

@@ -14,18 +14,18 @@ import pytest
 from experiments import evaluate
 from experiments.console import check_empty
 from tdanet_jax import config as configs
-from tdanet_jax import history, report, saved
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
-from tdanet_jax.history import Snapshot
-from tdanet_jax.saved import Saved
+from tdanet_jax.evaluation import report, saved_networks
+from tdanet_jax.evaluation.saved_networks import Saved
 from tdanet_jax.task import make_task
+from tdanet_jax.training import history
+from tdanet_jax.training.history import Snapshot
 from tdanet_jax.vocabulary import Action
-from tests.experiments import command
-from tests.experiments.pages import block
-from tests.experiments.test_faults import full_disk
-from tests.models import samples
-from tests.test_agent import OLD_RUN
-from tests.test_comparison import result as made_up
+from tests.agent.test_agent import OLD_RUN
+from tests.evaluation.test_comparison import result as made_up
+from tests.support import command, samples
+from tests.support.pages import block
+from tests.system.test_faults import full_disk
 
 
 def test_the_shortest_path_policy_scores_100(ithor, tmp_path):
@@ -165,7 +165,7 @@ def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch, capsys):
         def columns(self):
             return {}
 
-    monkeypatch.setattr(saved, "evaluate", lambda networks, greedy, seed: [Done()])
+    monkeypatch.setattr(saved_networks, "evaluate", lambda networks, greedy, seed: [Done()])
     monkeypatch.setattr(report, "all_rows", lambda tables, played: 1000 * [{"group": "seen"}])
     command, out = evaluate.Command(checkpoint=(tmp_path / "a",)), tmp_path / "out"
     with pytest.raises(OSError, match="File too large"), full_disk(5000):
@@ -192,7 +192,7 @@ def test_a_policy_of_ones_own_as_the_page_shows_it(ithor, few_episodes, capsys):
 def test_only_a_point_of_a_history_has_a_share_of_the_budget(tmp_path, point, share):
     snapshot = Snapshot(None, 40, 100, 1.0, 0 if point is None else 5, "d")
     provenance = report.Provenance("18/4", "tdanet", "sample", 100, 0, 0, 1600, "d")
-    done = saved.Evaluated(Saved(tmp_path, TINY, point), snapshot, None, provenance, {})
+    done = saved_networks.Evaluated(Saved(tmp_path, TINY, point), snapshot, None, provenance, {})
     found = done.results()
     assert (found["point"], found["share"]) == (None if point is None else 5, share)
 

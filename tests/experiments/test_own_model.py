@@ -10,12 +10,12 @@ import pytest
 
 import tdanet_jax
 from experiments import train_zero_shot
-from tdanet_jax.agent import Detection
-from tdanet_jax.classes import Classes
+from tdanet_jax.agent.agent import Detection
 from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.models.classes import Classes
 from tdanet_jax.task import make_model
-from tests.experiments import command
-from tests.experiments.pages import block
+from tests.support import command
+from tests.support.pages import block
 
 
 @pytest.mark.usefixtures("ithor")  # the rooms are there: no line about computing them

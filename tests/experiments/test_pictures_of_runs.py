@@ -13,11 +13,12 @@ import pytest
 
 from experiments import attention, evaluate, replay, trajectories
 from experiments.one_episode import Choice
-from tdanet_jax import devices, episodes
+from tdanet_jax.evaluation import episodes
 from tdanet_jax.scenes import dataset
 from tdanet_jax.scenes.offline import importer
-from tests import browser, original
+from tdanet_jax.training import devices
 from tests.conftest import TINY, save_untrained
+from tests.support import browser, original
 
 
 @pytest.mark.parametrize("command", [replay, trajectories, attention, evaluate])

@@ -5,10 +5,10 @@ import json
 import numpy as np
 
 from experiments import scaling
-from tdanet_jax import measure
 from tdanet_jax.config import TrainConfig
-from tdanet_jax.scenes.geometry import action_distances, transitions
+from tdanet_jax.scenes.visibility.geometry import action_distances, transitions
 from tdanet_jax.task import make_task
+from tdanet_jax.tools import benchmarking
 
 
 def test_joined_rooms_are_the_rooms_twice(some_rooms):
@@ -37,7 +37,7 @@ def test_it_writes_figures_and_a_plot(tmp_path, monkeypatch, ithor):
     def cost(model, words, params, count, repeats):
         return {"steps_per_second": count, "temporary_mb": len(words), "arguments_mb": 1.0}
 
-    monkeypatch.setattr(measure, "update_cost", cost)
+    monkeypatch.setattr(benchmarking, "update_cost", cost)
     sizes = ["--environments", "8", "16", "--rooms", "3", "--classes", "118", "--detections", "80"]
     scaling.main([*sizes, "--out", str(tmp_path / "out")])
     rows = [json.loads(line) for line in (tmp_path / "out/scaling.jsonl").read_text().splitlines()]

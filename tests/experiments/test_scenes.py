@@ -11,9 +11,9 @@ import pytest
 
 from experiments import scenes
 from tdanet_jax.scenes import SceneTables
-from tests.experiments.command import TINY
-from tests.experiments.pages import block
 from tests.scenes.test_metadata import DOCUMENT
+from tests.support.command import TINY
+from tests.support.pages import block
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ import time
 import pytest
 
 from experiments import evaluate, sweep
-from tdanet_jax import files
-from tests.test_comparison import result
-from tests.test_sweep import BASE, made
+from tdanet_jax.io import files
+from tests.evaluation.test_comparison import result
+from tests.evaluation.test_sweep import BASE, made
 
 COMMAND = [sys.executable, "-m", "experiments.sweep"]
 TINY = [

@@ -11,8 +11,8 @@ import pytest
 
 import tdanet_jax
 from experiments import evaluate, train_zero_shot
-from tdanet_jax import files
-from tests.experiments import command
+from tdanet_jax.io import files
+from tests.support import command
 
 WRITTEN = {
     "classes.json",

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tdanet_jax.env import Observation
+from tdanet_jax.env.dynamics import Observation
 from tdanet_jax.models.actor_critic import ActorCritic, Output
 from tdanet_jax.models.layers import TAPE, Carry
 from tdanet_jax.models.tdanet import TDANetEncoder
-from tests.models import equations, samples
-from tests.models.samples import observations
+from tests.support import equations, samples
+from tests.support.samples import observations
 
 T, B, H = 3, 2, 6
 CLOSE = {"rtol": 5e-5, "atol": 5e-6}  # float32 sums in another order, over three steps

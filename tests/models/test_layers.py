@@ -22,8 +22,8 @@ from tdanet_jax.models.layers import (
     paired_product,
     product,
 )
-from tests.models import equations
-from tests.models.samples import randomised
+from tests.support import equations
+from tests.support.samples import randomised
 
 #: Sums of a few dozen float32 products, in another order.
 CLOSE = {"rtol": 2e-5, "atol": 2e-6}

@@ -16,9 +16,8 @@ from tdanet_jax.config import NetworkConfig
 from tdanet_jax.models import actor_critic, li
 from tdanet_jax.models.actor_critic import ActorCritic, Output
 from tdanet_jax.models.mjolnir import KERNELS
-from tdanet_jax.models.rows import class_rows, make_table
-from tests.models import class_equations, equations, samples
-from tests.models.test_adaptation import (
+from tdanet_jax.models.shared.class_rows import class_rows, make_table
+from tests.models.shared.test_adaptation import (
     FRESH,
     LIMIT,
     RATE,
@@ -27,6 +26,7 @@ from tests.models.test_adaptation import (
     slow_rollout,
 )
 from tests.models.test_mjolnir import KNOWN, VOCABULARY, WORDS, observations, rows_of
+from tests.support import class_equations, equations, samples
 
 T, B, H, WIDTH = 5, 3, 4, 7  # two stretches of two steps, and one step more
 MODEL = dataclasses.replace(

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
-from tdanet_jax import graph
-from tdanet_jax.classes import Classes
-from tdanet_jax.env import Observation
-from tdanet_jax.models.image import CELLS, CHANNELS, DROPOUT_UNITS
+from tdanet_jax.env.dynamics import Observation
+from tdanet_jax.models import class_graph
+from tdanet_jax.models.classes import Classes
 from tdanet_jax.models.layers import TAPE
 from tdanet_jax.models.mjolnir import MjolnirOEncoder, MjolnirREncoder
-from tests.models import class_equations, equations, samples
-from tests.models.samples import CLASSES, WIDTH
+from tdanet_jax.models.shared.image import CELLS, CHANNELS, DROPOUT_UNITS
+from tests.support import class_equations, equations, samples
+from tests.support.samples import CLASSES, WIDTH
 
 KNOWN = (0, 1, 3, 4, 6, 8)
 VOCABULARY = Classes(
@@ -112,7 +112,7 @@ def test_layers_and_their_sizes_and_the_graph_at_the_start() -> None:
         }
     }
     adjacency = fresh_parameters()["graph"]["adjacency"]
-    np.testing.assert_array_equal(adjacency, graph.normalised(VOCABULARY))
+    np.testing.assert_array_equal(adjacency, class_graph.normalised(VOCABULARY))
 
 
 def test_a_bfloat16_encoder_is_close_and_returns_float32() -> None:

@@ -10,19 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tdanet_jax import graph
-from tdanet_jax.classes import Classes
-from tdanet_jax.models import sp
+from tdanet_jax.models import class_graph, sp
+from tdanet_jax.models.classes import Classes
 from tdanet_jax.models.sp import ScenePriorsEncoder
-from tests.models import equations, samples
-from tests.models.samples import CLASSES, observations
+from tests.support import equations, samples
+from tests.support.samples import CLASSES, observations
 
 T, B = 2, 3
 CLOSE = {"rtol": 5e-5, "atol": 1e-5}  # float32 sums in another order
 WORDS = jnp.asarray(samples.words())
 KNOWN = (0, 1, 3, 4, 7)
 EDGES = ((0, 3, 1.0), (1, 3, 0.5), (4, 7, 1.0), (0, 4, 0.25))
-ADJACENCY = graph.normalised(Classes(tuple(map(str, range(CLASSES))), KNOWN, EDGES))
+ADJACENCY = class_graph.normalised(Classes(tuple(map(str, range(CLASSES))), KNOWN, EDGES))
 ENCODER = ScenePriorsEncoder(
     known=KNOWN, adjacency=tuple(map(tuple, ADJACENCY.tolist())), features=6, width=8
 )

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tdanet_jax.env import Observation
+from tdanet_jax.env.dynamics import Observation
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.layers import TAPE
-from tdanet_jax.models.rows import class_rows, make_table
+from tdanet_jax.models.shared.class_rows import class_rows, make_table
 from tdanet_jax.models.ssnet import SSNetEncoder
-from tests.models import class_equations, equations, samples
-from tests.models.samples import CLASSES
+from tests.support import class_equations, equations, samples
+from tests.support.samples import CLASSES
 
 KNOWN = (0, 1, 3, 4, 6, 8)
 T, B, H = 3, 4, 6

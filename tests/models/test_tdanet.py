@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tdanet_jax.env import Observation
+from tdanet_jax.env.dynamics import Observation
 from tdanet_jax.models.tdanet import TDANetEncoder
-from tests.models import equations, samples
-from tests.models.samples import CLASSES, DETECTIONS, WIDTH, observations
+from tests.support import equations, samples
+from tests.support.samples import CLASSES, DETECTIONS, WIDTH, observations
 
 H = 7
 FRAMES = 12

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tdanet_jax import files
+from tdanet_jax.io import files
 from tdanet_jax.scenes import cache, ithor, tables
-from tests import toy
+from tests.support import toy
 
 # Builds (slowly enough to overlap) and prints the tables' version.
 BUILDER = """

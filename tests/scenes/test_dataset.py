@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tdanet_jax.scenes import SceneTables, archive, dataset, tables
+from tdanet_jax.io import archive
+from tdanet_jax.io.untrusted import FileError
+from tdanet_jax.scenes import SceneTables, dataset, tables
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode, Rooms
-from tdanet_jax.untrusted import FileError
 from tdanet_jax.vocabulary import make_split
-from tests import toy
+from tests.support import toy
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tdanet_jax.scenes import SceneError, floor_plan, tables
-from tests import toy
+from tests.support import toy
 
 
 def test_outlines_of_the_boxes_of_a_room_of_ones_own():

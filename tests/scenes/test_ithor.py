@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tdanet_jax import assets, bundle
-from tdanet_jax.scenes import SceneError, geometry, ithor, metadata
+from tdanet_jax.io import assets
+from tdanet_jax.io.untrusted import npz
+from tdanet_jax.scenes import SceneError, ithor, metadata
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, REACH
-from tdanet_jax.untrusted import npz
+from tdanet_jax.scenes.visibility import geometry
+from tdanet_jax.tools import build_assets
 from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
 
 WHEELS = os.environ.get("TDANET_WHEELS")  # folder with the wheels of bundle.SOURCES
@@ -156,7 +158,7 @@ def test_no_pickles_in_the_asset() -> None:
 
 @needs_wheels
 def test_the_asset_regenerates_bit_by_bit(tmp_path: Path) -> None:
-    bundle.build(tmp_path, Path(str(WHEELS)))
+    build_assets.build(tmp_path, Path(str(WHEELS)))
     listed = json.loads((tmp_path / assets.CHECKSUMS).read_text())
     bundled = json.loads((assets.folder() / assets.CHECKSUMS).read_text())
     assert listed.items() <= bundled.items()
@@ -165,7 +167,7 @@ def test_the_asset_regenerates_bit_by_bit(tmp_path: Path) -> None:
 
 @needs_wheels
 def test_robothor_objects_parse() -> None:
-    with zipfile.ZipFile(bundle.fetch(bundle.PROCTHOR, Path(str(WHEELS)))) as wheel:
+    with zipfile.ZipFile(build_assets.fetch(build_assets.PROCTHOR, Path(str(WHEELS)))) as wheel:
         content = json.loads(wheel.read(ithor.METADATA))["robothor"]
     assert len(content) == 75
     spots = np.array([(0.0, 0.9, 0.0)])

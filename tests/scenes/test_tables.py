@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tdanet_jax.scenes import SceneError, SceneTables, geometry, tables
+from tdanet_jax.scenes import SceneError, SceneTables, tables
 from tdanet_jax.scenes.scene import Scene
+from tdanet_jax.scenes.visibility import geometry
 from tdanet_jax.vocabulary import ALL_TARGETS
-from tests import toy
+from tests.support import toy
 
 # Of the bundled rooms. A change means that every published number has to be measured anew.
 DATA_VERSION = "d4909be88f83"

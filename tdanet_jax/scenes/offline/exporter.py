@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax import files
-from tdanet_jax.scenes.geometry import transitions
+from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import hdf5
 from tdanet_jax.scenes.offline.importer import Report
 from tdanet_jax.scenes.offline.layout import (
     BOX_FILE,
@@ -27,7 +27,7 @@ from tdanet_jax.scenes.offline.layout import (
     state_keys,
 )
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.untrusted import hdf5
+from tdanet_jax.scenes.visibility.geometry import transitions
 from tdanet_jax.vocabulary import ROOM_TYPES
 
 Parents = Mapping[str, Mapping[str, Mapping[str, float]]]

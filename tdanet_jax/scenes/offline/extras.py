@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from tdanet_jax.io.untrusted import FileError, jsons, pickles
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
 from tdanet_jax.scenes.offline.layout import PARENT_FILE, ROOM_NAMES, Grid, scene_of
-from tdanet_jax.untrusted import FileError, jsons, pickles
 from tdanet_jax.vocabulary import ROOM_TYPES
 
 MOST_EPISODES, MOST_CLASSES = 100_000, 2_000

@@ -12,8 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax import files
-from tdanet_jax.scenes import archive, cache, dataset, poses
+from tdanet_jax import poses
+from tdanet_jax.io import archive, files
+from tdanet_jax.io.untrusted import FileError, hdf5, npz
+from tdanet_jax.poses import VIEWS
+from tdanet_jax.scenes import cache, dataset
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.offline.extras import read_extras
 from tdanet_jax.scenes.offline.layout import (
@@ -28,11 +31,9 @@ from tdanet_jax.scenes.offline.layout import (
     scene_of,
 )
 from tdanet_jax.scenes.offline.reader import SceneData, describe, read_scene
-from tdanet_jax.scenes.poses import VIEWS
 from tdanet_jax.scenes.scene import MOST_CLASSES, Scene, SceneObject
 from tdanet_jax.scenes.tables import SceneTables, join, tabulate
-from tdanet_jax.scenes.visibility import Sight
-from tdanet_jax.untrusted import FileError, hdf5, npz
+from tdanet_jax.scenes.visibility.build import Sight
 from tdanet_jax.vocabulary import ALL_TARGETS
 
 SOURCES = (GRID_FILE, GRAPH_FILE, BOX_FILE, OBJECT_FILE, *VISIBILITY_FILES)

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tdanet_jax.scenes import poses
+from tdanet_jax import poses
+from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes.metadata import ALIGNED
 from tdanet_jax.scenes.scene import GRID
-from tdanet_jax.untrusted import FileError
 from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
 
 GRID_FILE, GRAPH_FILE, BOX_FILE = "grid.json", "graph.json", "objects_bb.json"

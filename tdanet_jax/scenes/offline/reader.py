@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax.scenes import poses
+from tdanet_jax import poses
+from tdanet_jax.io.untrusted import FileError, jsons
+from tdanet_jax.poses import HORIZONS, ROTATIONS, VIEWS
 from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.geometry import STEPS, transitions
 from tdanet_jax.scenes.metadata import FARTHEST, check_points
 from tdanet_jax.scenes.offline.layout import (
     BOX_FILE,
@@ -23,10 +24,9 @@ from tdanet_jax.scenes.offline.layout import (
     Grid,
     first_file,
 )
-from tdanet_jax.scenes.poses import HORIZONS, ROTATIONS, VIEWS
 from tdanet_jax.scenes.scene import GRID, Scene, SceneObject
-from tdanet_jax.scenes.visibility import IMAGE, SUBPIXEL, Sight
-from tdanet_jax.untrusted import FileError, jsons
+from tdanet_jax.scenes.visibility.build import IMAGE, SUBPIXEL, Sight
+from tdanet_jax.scenes.visibility.geometry import STEPS, transitions
 
 #: The box of an object that is known to be visible, but not where.
 NO_BOX = (-1, -1, -1, -1)

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tdanet_jax import episodes, zero_shot
 from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.env import zero_shot
+from tdanet_jax.evaluation import episodes
+from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.offline import extras, importer
 from tdanet_jax.task import make_task
-from tdanet_jax.untrusted import FileError
 from tdanet_jax.words import WordVectors
-from tests import original
+from tests.support import original
 
 
 @pytest.fixture

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes.offline import layout, reader
 from tdanet_jax.scenes.offline.reader import SceneData
-from tdanet_jax.untrusted import FileError
-from tests import original
-from tests.original import APPLE, KEYS, MUG, TABLE
+from tests.support import original
+from tests.support.original import APPLE, KEYS, MUG, TABLE
 
 AHEAD = [0, 1, 2]  # places in KEYS: 16 a point
 

@@ -14,13 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tdanet_jax import words
-from tdanet_jax.reward import find_parents, named_parents, published_parents
+from tdanet_jax.env.reward import find_parents, named_parents, published_parents
+from tdanet_jax.io.untrusted import FileError, hdf5
 from tdanet_jax.scenes import SceneTables, dataset, tables
 from tdanet_jax.scenes.offline import exporter, importer, reader
 from tdanet_jax.scenes.offline.layout import OBJECT_FILE, state_keys
-from tdanet_jax.untrusted import FileError, hdf5
 from tdanet_jax.vocabulary import TARGETS, make_split
-from tests import original, toy
+from tests.support import original, toy
 
 
 def silent(share: float, line: str) -> None:

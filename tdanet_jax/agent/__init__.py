@@ -1,0 +1,1 @@
+"""A trained agent on its own: detections in, actions out."""

@@ -1,0 +1,272 @@
+"""A trained agent on its own: detections of any detector in, an action out.
+
+agent = tdanet_jax.load("runs/my-run")
+memory = agent.start()
+memory, decision = agent.act(memory, [Detection("mug", 0.2, 0.3, 0.25, 0.4)], target="mug")
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tdanet_jax import config as configs
+from tdanet_jax import words as word_vectors
+from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.env.dynamics import Observation
+from tdanet_jax.models import actor_critic
+from tdanet_jax.models import classes as vocabularies
+from tdanet_jax.models.actor_critic import ActorCritic, Output
+from tdanet_jax.models.classes import Classes
+from tdanet_jax.models.layers import Carry
+from tdanet_jax.sensors import odometry
+from tdanet_jax.sensors.detections import centre_and_area, merge_classes
+from tdanet_jax.sensors.odometry import Trail
+from tdanet_jax.task import make_model
+from tdanet_jax.training import history
+from tdanet_jax.training.checkpoint import newest
+from tdanet_jax.vocabulary import NUM_ACTIONS, Action, class_words
+from tdanet_jax.words import WordVectors
+
+#: Rows and labels are padded to multiples of these, so that few shapes are ever compiled.
+ROW_BLOCK, LABEL_BLOCK = 16, 64
+#: Degrees by which a simulator may miss a multiple of 45.
+TOLERANCE = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class Detection:
+    """One detected object: a label in English and its box as shares of the image, y down."""
+
+    label: str
+    x1: float
+    y1: float
+    x2: float
+    y2: float
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if the box is not one inside the image."""
+        if not (0 <= self.x1 <= self.x2 <= 1 and 0 <= self.y1 <= self.y2 <= 1):
+            raise ValueError(f"{self}: corners must be shares of the image, x1 <= x2 and y1 <= y2")
+
+
+class Memory(NamedTuple):
+    """What the agent carries from step to step of one episode."""
+
+    carry: Carry  # each [1, H]
+    previous: jax.Array  # [1, 6], action probabilities of the step before
+    action: jax.Array  # int32, the action before; 6 at the start
+    trail: Trail | None  # the way up to that action; if the network senses it
+    target: jax.Array  # int32, what it looked for in the step before; -1 at the start
+
+
+class Decision(NamedTuple):
+    """What the agent does, and why."""
+
+    action: Action
+    probabilities: np.ndarray  # [6], in the order of `Action`
+    value: float  # expected discounted return
+    attention: np.ndarray | None  # [n], weight of each detection; None if the model has none
+
+
+class Agent:
+    """A trained network with its configuration and word vectors.
+
+    Attributes:
+      config: the training run's configuration.
+      classes: the training run's vocabulary. A model with a row per class sees objects of the
+        known classes alone; any other sees whatever has a name.
+      model, weights: the network and its parameters.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        weights: Any,
+        vectors: WordVectors,
+        classes: Classes | None = None,
+    ) -> None:
+        self.config = config
+        self.classes = Classes() if classes is None else classes
+        self.model: ActorCritic = make_model(config, self.classes)
+        self.weights = weights
+        self._vectors = vectors
+        self._labels = {class_words(name): i for i, name in enumerate(self.classes.names)}
+        self._table: Any = None
+        self._decide = jax.jit(self._forward)
+
+    def start(self, rotation: float = 0, horizon: float = 0) -> Memory:
+        """The memory at the start of an episode.
+
+        Args:
+          rotation: degrees, a multiple of 45; multiples of 90 lie along the grid on which the agent
+            moves. Only networks that sense their way (`--odometry`) need it.
+          horizon: degrees, 0 or 30, looking down; likewise.
+
+        Raises:
+          ValueError: the rotation is no multiple of 45, or the horizon neither 0 nor 30.
+        """
+        eighths = round(rotation / 45)
+        if abs(rotation - 45 * eighths) > TOLERANCE:
+            raise ValueError(f"rotation {rotation}: not a multiple of 45 degrees")
+        if min(abs(horizon), abs(horizon - 30)) > TOLERANCE:
+            raise ValueError(f"horizon {horizon}: neither 0 nor 30 degrees")
+        trail = None
+        if self.model.odometry:
+            diagonal, down = jnp.int32(eighths % 2), jnp.int32(horizon > 15)
+            trail = odometry.begin(diagonal, down, self.model.triangulation)
+        return Memory(
+            carry=self.model.initial_carry(1, self.weights),
+            previous=jnp.zeros((1, NUM_ACTIONS)),
+            action=jnp.int32(NUM_ACTIONS),
+            trail=trail,
+            target=jnp.int32(-1),
+        )
+
+    def act(
+        self,
+        memory: Memory,
+        detections: Sequence[Detection],
+        target: str,
+        key: jax.Array | None = None,
+        blocked: bool | None = None,
+    ) -> tuple[Memory, Decision]:
+        """One step.
+
+        The memory takes it that the decision is carried out (else, replace its `action`), and that
+        a MoveAhead leads to the next point of the grid: 0.25 m on one axis, on both along a
+        diagonal. A network that senses its target's place (`--triangulation`) takes it that the
+        view is 90 degrees wide and high.
+
+        Args:
+          memory: from `start` or the step before.
+          detections: the objects in view, in any order.
+          target: what to look for, in English.
+          key: samples the action, as in training; None takes the most probable one.
+          blocked: whether the agent did not move in the action before (AI2-THOR's
+            `lastActionSuccess` was False). Networks that sense their way need it behind a
+            MoveAhead, and behind no other action.
+
+        Raises:
+          KeyError: a label has a word without a word vector.
+          ValueError: the model looks at an image, and not at detections; or it senses its way and
+            is not told whether its MoveAhead was blocked.
+        """
+        if self.model.encoder.IMAGE:
+            raise ValueError(
+                f"{self.config.model} looks at an image; an agent is shown detections alone"
+            )
+        if memory.trail is not None and blocked is None and memory.action == Action.MOVE_AHEAD:
+            raise ValueError("the agent senses its way: say whether its MoveAhead was `blocked`")
+        obs, owner = self._observe(detections, target)
+        memory, out, attention = self._decide(
+            self.weights, self._prepared(), memory, obs, jnp.asarray(bool(blocked))
+        )
+        logits, value = out
+        best = jnp.argmax(logits, -1) if key is None else jax.random.categorical(key, logits)
+        decision = Decision(
+            action=Action(int(best[0])),
+            probabilities=np.asarray(memory.previous[0]),
+            value=float(value[0]),
+            attention=None if attention is None else np.asarray(attention[0])[owner],
+        )
+        return memory._replace(action=best[0]), decision
+
+    def knows(self, label: str) -> bool:
+        """Whether a label has a word vector, so that it can be detected or looked for."""
+        return not self._vectors.missing([label])
+
+    def _observe(
+        self, detections: Sequence[Detection], target: str
+    ) -> tuple[Observation, np.ndarray]:
+        """The frame as the network sees it, and the row of each detection.
+
+        A row per detection; for a model made for it, a row per class.
+        """
+        labels = np.array([self._index(d.label) for d in detections], np.int32)
+        corners = np.array([(d.x1, d.y1, d.x2, d.y2) for d in detections]).reshape(-1, 4)
+        if (self.model.encoder.ROWS or self.config.network.rows) == "class":
+            labels, owner = np.unique(labels, return_inverse=True)
+            order = np.argsort(owner, kind="stable")
+            _, found = merge_classes(owner[order], corners[order])
+        else:
+            owner, found = np.arange(len(labels)), centre_and_area(corners)
+        count = len(labels)
+        rows = max(-(-count // ROW_BLOCK), 1) * ROW_BLOCK
+        classes, boxes = np.zeros((1, rows), np.int32), np.zeros((1, rows, 3), np.float32)
+        classes[0, :count], boxes[0, :count] = labels, found
+        observation = Observation(
+            classes=jnp.asarray(classes),
+            boxes=jnp.asarray(boxes),
+            mask=jnp.arange(rows)[None] < count,
+            target=jnp.full(1, self._index(target), jnp.int32),
+            empty=jnp.full(1, not detections),
+        )
+        return observation, owner
+
+    def _index(self, label: str) -> int:
+        """The row of a label in the table of classes; a new label gets a new row."""
+        words = class_words(label)
+        if words not in self._labels:
+            self._vectors.embed(label)  # an unknown word is an error before anything changes
+            self._labels[words] = len(self._labels)
+            self._table = None
+        return self._labels[words]
+
+    def _prepared(self) -> Any:
+        if self._table is None:
+            names = [" ".join(words) for words in self._labels]
+            table = self._vectors.table(names, self.config.network.word_norm)
+            rest = -len(table) % LABEL_BLOCK
+            words = jnp.asarray(np.pad(table, ((0, rest), (0, 0))))
+            self._table = actor_critic.prepare(self.model, self.weights, words)
+        return self._table
+
+    def _forward(
+        self, weights: Any, table: Any, memory: Memory, obs: Observation, blocked: jax.Array
+    ) -> tuple[Memory, Output, jax.Array | None]:
+        """What the network says and attends to, and the memory behind it but for the action."""
+        trail = memory.trail
+        if trail is not None:
+            trail = odometry.follow(trail, memory.action, blocked)
+            is_target = obs.mask[0] & (obs.classes[0] == obs.target[0])
+            trail = odometry.forget(trail, memory.target != obs.target[0])
+            trail = odometry.look(trail, obs.boxes[0], is_target)
+            obs = obs.replace(odometry=jax.tree.map(lambda x: x[None], odometry.sense(trail)))
+        variables = {"params": weights}
+        attention: Any = self.model.apply(variables, table, obs, method="attention")
+        carry, out = actor_critic.forward(
+            self.model, weights, table, memory.carry, obs, memory.previous, jnp.zeros(1, bool)
+        )
+        previous = jax.nn.softmax(out.logits)
+        return Memory(carry, previous, memory.action, trail, obs.target[0]), out, attention
+
+
+def load(run: Path | str) -> Agent:
+    """The agent of a run's newest checkpoint, or of a point of its history. Needs no rooms.
+
+    Args:
+      run: the run's folder, or a file `history/<updates>.npz` in it.
+
+    Raises:
+      ValueError: the folder holds no run, or its checkpoint cannot be read.
+    """
+    config, weights, classes = read(run)
+    vectors = word_vectors.load(config.word_vectors, classes.names)
+    return Agent(config, weights, vectors, classes)
+
+
+def read(run: Path | str) -> tuple[TrainConfig, Any, Classes]:
+    """What `load` makes an agent of: configuration, parameters, vocabulary."""
+    path = Path(run)
+    point = path.suffix == history.SUFFIX
+    folder = path.parent.parent if point else path
+    config = configs.load(folder / CONFIG_FILE)
+    snapshot = history.read(path) if point else newest(folder)
+    return config, snapshot.weights, vocabularies.load(folder)

@@ -1,0 +1,221 @@
+"""A trained agent in AI2-THOR itself, for those who have Unity (`pip install ai2thor`).
+
+controller = Controller(scene="FloorPlan228", **SETTINGS)  # from ai2thor.controller
+episode = play(controller, tdanet_jax.load("runs/my-run"), "Laptop")
+
+The controller is an argument: this module needs neither Unity nor the `ai2thor` package. What it
+relies on, and what of it was never tried: docs/analysis.md.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple, Protocol
+
+import jax
+
+from tdanet_jax.agent.agent import Agent, Decision, Detection
+from tdanet_jax.poses import ROTATIONS
+from tdanet_jax.scenes.metadata import IGNORED
+from tdanet_jax.scenes.scene import GRID, REACH
+from tdanet_jax.scenes.tables import FIELD_OF_VIEW
+from tdanet_jax.scenes.visibility.build import IMAGE
+from tdanet_jax.scenes.visibility.geometry import STEPS
+from tdanet_jax.vocabulary import ACTION_NAMES, Action, class_words
+
+#: Arguments of AI2-THOR's `Controller` that fit the rooms in which agents are trained.
+SETTINGS: dict[str, Any] = {
+    "width": IMAGE,
+    "height": IMAGE,
+    "fieldOfView": FIELD_OF_VIEW,
+    "visibilityDistance": REACH,
+    "gridSize": GRID,
+    "rotateStepDegrees": 360 // ROTATIONS,
+    "snapToGrid": False,  # AI2-THOR refuses to snap beside turns of 45 degrees
+    "renderInstanceSegmentation": True,
+}
+
+#: Object types that are parts of the building: the rooms in which agents are trained hold none.
+STRUCTURE = frozenset({IGNORED, "Ceiling", "Door", "Doorframe", "Doorway", "Room", "Wall"})
+
+#: Metres and degrees by which AI2-THOR may miss the pose that the actions lead to.
+NEAR, ALIGNED = 0.05, 1.0
+
+
+class Event(Protocol):
+    """What is read of AI2-THOR's `Event`: a frame behind an action."""
+
+    metadata: Any  # agent, objects, lastActionSuccess, errorMessage
+    instance_detections2D: Any  # object's id -> x1, y1, x2, y2: first and last pixel, y down
+    screen_width: int  # pixels
+    screen_height: int
+
+
+class Controller(Protocol):
+    """What is used of AI2-THOR's `Controller`."""
+
+    last_event: Any
+
+    def step(self, action: str, **arguments: Any) -> Any:
+        """Takes an action and returns its `Event`."""
+
+
+class Place(NamedTuple):
+    """Where AI2-THOR's agent is."""
+
+    x: float  # metres
+    z: float  # metres
+    rotation: float  # degrees clockwise from +z
+    horizon: float  # degrees down
+
+    def __str__(self) -> str:
+        """As errors say it."""
+        x, z, rotation, horizon = (round(value, 2) for value in self)
+        return f"x {x:g}, z {z:g}, rotation {rotation:g}, horizon {horizon:g}"
+
+
+class Episode(NamedTuple):
+    """An episode of T actions."""
+
+    decisions: tuple[Decision, ...]  # T
+    places: tuple[Place, ...]  # T + 1, before each action and at the end
+    success: bool  # Done while AI2-THOR calls an object of the target's type visible
+    unnamed: frozenset[str]  # object types in view that have no word vector, and were left out
+
+    @property
+    def actions(self) -> tuple[Action, ...]:
+        """The T actions."""
+        return tuple(decision.action for decision in self.decisions)
+
+
+def detections(event: Event) -> list[Detection]:
+    """The objects in view, labelled by their type, without parts of the building.
+
+    A segment that is none of the metadata's objects (a wall, the ceiling) is no detection.
+
+    Raises:
+      ValueError: the frame has no detections, as its controller was not asked for them.
+    """
+    boxes = getattr(event, "instance_detections2D", None)
+    if boxes is None:
+        raise ValueError(
+            "no instance_detections2D in this frame: make the controller with "
+            "renderInstanceSegmentation=True, for one agent"
+        )
+    kinds = {item["objectId"]: item["objectType"] for item in event.metadata["objects"]}
+    wide, high = event.screen_width, event.screen_height
+    return [
+        # The last pixel is inside the box: its far side is one further.
+        Detection(kinds[name], x1 / wide, y1 / high, (x2 + 1) / wide, (y2 + 1) / high)
+        for name, (x1, y1, x2, y2) in boxes.items()
+        if name in kinds and kinds[name] not in STRUCTURE
+    ]
+
+
+def is_visible(event: Event, target: str) -> bool:
+    """Whether AI2-THOR calls an object of this type visible: in view and within 1.5 m."""
+    words = class_words(target)
+    return any(
+        item["visible"] and class_words(item["objectType"]) == words
+        for item in event.metadata["objects"]
+    )
+
+
+def play(
+    controller: Controller,
+    agent: Agent,
+    target: str,
+    key: jax.Array | None = None,
+    step_limit: int = 100,
+) -> Episode:
+    """One episode, from where AI2-THOR's agent is now.
+
+    Actions do what they do in the environment. MoveAhead along a diagonal goes one cell along both
+    axes. A look beyond level and 30 degrees down, which AI2-THOR would allow, is not passed on, and
+    neither is Done: it ends the episode, which is judged by the last frame.
+
+    Args:
+      controller: made with `SETTINGS`, its agent on the grid, at a multiple of 45 degrees.
+      target: what to look for, in English; an object type such as "Laptop" if success matters.
+      key: samples the actions, as in training; None takes the most probable ones.
+      step_limit: actions after which the episode ends without success. Test episodes have 100, and
+        200 in living rooms.
+
+    Raises:
+      KeyError: the target has a word without a word vector.
+      ValueError: the start is at no multiple of 45 degrees or looks neither level nor 30 degrees
+        down; frames have no detections; an action did not lead where it should, as with other
+        settings; or the agent looks at an image.
+    """
+    if step_limit < 1:
+        raise ValueError(f"step_limit {step_limit}: must be at least 1")
+    event = controller.last_event
+    places, decisions, unnamed = [_place(event)], [], set[str]()
+    memory = agent.start(places[0].rotation, places[0].horizon)
+    expected, blocked = _on_the_grid(places[0]), False
+    for step in range(step_limit):
+        seen = detections(event)
+        named = [found for found in seen if agent.knows(found.label)]
+        unnamed |= {found.label for found in seen} - {found.label for found in named}
+        now = None if key is None else jax.random.fold_in(key, step)
+        memory, decision = agent.act(memory, named, target, now, blocked)
+        decisions.append(decision)
+        event, expected, blocked = _take(controller, event, expected, decision.action)
+        places.append(_place(event))
+        if decision.action == Action.DONE:
+            break
+    success = decisions[-1].action == Action.DONE and is_visible(event, target)
+    return Episode(tuple(decisions), tuple(places), success, frozenset(unnamed))
+
+
+def _place(event: Event) -> Place:
+    agent = event.metadata["agent"]
+    position = agent["position"]
+    return Place(position["x"], position["z"], agent["rotation"]["y"], agent["cameraHorizon"])
+
+
+def _on_the_grid(place: Place) -> Place:
+    """With the angles that it means."""
+    rotation, horizon = (
+        45 * (round(place.rotation / 45) % ROTATIONS),
+        30 * round(place.horizon / 30),
+    )
+    return place._replace(rotation=rotation, horizon=horizon)
+
+
+def _take(
+    controller: Controller, event: Event, before: Place, action: Action
+) -> tuple[Event, Place, bool]:
+    """The frame behind an action, where the agent should be, and whether it was blocked.
+
+    Args:
+      before: where the agent should be before it; what AI2-THOR misses does not add up.
+
+    Raises:
+      ValueError: AI2-THOR's agent is not where the actions so far lead.
+    """
+    heading, down = round(before.rotation / 45), round(before.horizon / 30)
+    right = (action == Action.ROTATE_RIGHT) - (action == Action.ROTATE_LEFT)
+    turned = (heading + right) % ROTATIONS
+    looking = {Action.LOOK_UP: 0, Action.LOOK_DOWN: 1}.get(action, down)
+    ahead = action == Action.MOVE_AHEAD
+    if not ahead and (turned, looking) == (heading, down):
+        return event, before, False
+    dx, dz = (GRID * int(cells) for cells in STEPS[heading])
+    arguments = {"moveMagnitude": math.hypot(dx, dz)} if ahead else {}
+    event = controller.step(action=ACTION_NAMES[action], **arguments)
+    moved = ahead and bool(event.metadata["lastActionSuccess"])
+    x, z = (before.x + dx, before.z + dz) if moved else (before.x, before.z)
+    expected, after = Place(x, z, 45 * turned, 30 * looking), _place(event)
+    if not _alike(expected, after):
+        raise ValueError(
+            f"{ACTION_NAMES[action]} from {before} led to {after} and not to {expected}; is the "
+            f"controller made with SETTINGS? {event.metadata['errorMessage']}".rstrip()
+        )
+    return event, expected, ahead and not moved
+
+
+def _alike(one: Place, other: Place) -> bool:
+    turn = (one.rotation - other.rotation + 180) % 360 - 180
+    near = math.hypot(one.x - other.x, one.z - other.z) < NEAR
+    return near and max(abs(turn), abs(one.horizon - other.horizon)) < ALIGNED

@@ -1,0 +1,1 @@
+"""Looking at agents and rooms: traces, attention, replays and figures."""

@@ -1,0 +1,125 @@
+"""One episode by name: in a room with a target and a start, or one that a run has recorded."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tdanet_jax import poses
+from tdanet_jax.evaluation import episodes
+from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.evaluation.report import EPISODES_FILE
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
+
+#: How far from a start the nearest reachable point may be, in metres.
+FARTHEST_START = 0.5
+
+
+class Start(NamedTuple):
+    """Where an episode starts; the nearest reachable point is taken, at most 0.5 m away."""
+
+    x: float  # metres
+    z: float  # metres
+    rotation: int  # degrees clockwise from +z, a multiple of 45
+    horizon: int = 0  # degrees down, 0 or 30
+
+
+class Recorded(NamedTuple):
+    """An episode of a run's `episodes.jsonl`."""
+
+    episode: Episodes
+    actions: np.ndarray  # [T] int
+
+
+def find(
+    tables: SceneTables, scene: str, target: str, start: Start | None = None, seed: int = 0
+) -> Episodes:
+    """One episode in a room.
+
+    Args:
+      start: by default one is drawn, as those of tests are.
+      seed: of the drawn start.
+
+    Raises:
+      ValueError: no such room, target or heading, no reachable point near the start, or the target
+        is out of reach; the message says what there is.
+    """
+    if scene not in tables.scenes:
+        raise ValueError(f"{scene}: no such room; there are {name_ranges(tables.scenes)}")
+    index = tables.scenes.index(scene)
+    within = tables.distance[tables.state_scene == index].max(axis=0, initial=-1) >= 0
+    found = sorted(name for name, ok in zip(tables.targets, within, strict=True) if ok)
+    if target not in found:
+        raise ValueError(
+            f"{target}: no target that can be seen in {scene}; there: {', '.join(found) or 'none'}"
+        )
+    if start is None:
+        room = ROOM_TYPES[tables.room_type[index]]
+        return episodes.draw(tables, [scene], {room: [target]}, 1, seed)
+    pose, goal = tables.nearest_state(index, *start), tables.targets.index(target)
+    x, _, z = tables.position[poses.split(pose).position]
+    away = math.hypot(x - start.x, z - start.z)
+    if not away <= FARTHEST_START:  # nor where it is no number
+        raise ValueError(
+            f"start at x {start.x:g}, z {start.z:g}: {away:.2f} m from the nearest place to stand "
+            f"in {scene}, x {x:g}, z {z:g}; at most {FARTHEST_START} m"
+        )
+    if tables.distance[pose, goal] < 0:
+        raise ValueError(f"{target}: out of reach from x {start.x:g}, z {start.z:g} in {scene}")
+    return Episodes(np.array([pose], np.int32), np.array([goal], np.int32))
+
+
+def name_ranges(names: Sequence[str]) -> str:
+    """Names in short: "FloorPlan1-30, FloorPlan201-230"."""
+    stems = [re.sub(r"\d+$", "", name) for name in names]
+    numbers = [int(name[len(stem) :] or -1) for name, stem in zip(names, stems, strict=True)]
+    # Within a run of numbers, number minus place stays the same.
+    runs = itertools.groupby(range(len(names)), key=lambda i: (stems[i], numbers[i] - i))
+    parts = []
+    for _, members in runs:
+        first, *rest = members
+        parts.append(names[first] + (f"-{numbers[rest[-1]]}" if rest else ""))
+    return ", ".join(parts)
+
+
+def read_record(run: Path | str, index: int, tables: SceneTables) -> Recorded:
+    """Episode `index`, counted from 0, of a run's `episodes.jsonl`.
+
+    Raises:
+      ValueError: there is no such episode, or it does not belong to these tables.
+    """
+    path = Path(run) / EPISODES_FILE
+    try:
+        lines = path.read_text().splitlines()
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; a run writes it when training ends") from None
+    if not 0 <= index < len(lines):
+        raise ValueError(f"{path}: no episode {index}; there are 0 to {len(lines) - 1}")
+    try:
+        return _parse(json.loads(lines[index]), tables)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}, line {index + 1}: {error}") from None
+
+
+def _parse(row: dict[str, Any], tables: SceneTables) -> Recorded:
+    start = Start(float(row["x"]), float(row["z"]), int(row["rotation"]), int(row["horizon"]))
+    episode = find(tables, row["scene"], row["target"], start)
+    for name in row["actions"]:
+        if name not in ACTION_NAMES:
+            raise ValueError(f"{name!r}: no action; there are {', '.join(ACTION_NAMES)}")
+    actions = np.array([ACTION_NAMES.index(name) for name in row["actions"]], int)
+    place = tables.position[poses.split(episode.pose[0]).position][[0, 2]]
+    here = bool(np.allclose(place, start[:2], atol=1e-3))
+    if not here or tables.distance[episode.pose[0], episode.target[0]] + 1 != row["L"]:
+        raise ValueError("recorded on other scene tables")
+    if not len(actions):
+        raise ValueError("no actions")
+    return Recorded(episode, actions)

@@ -1,0 +1,169 @@
+"""Where names go in a picture so that none covers another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from tdanet_jax.analysis.trace import View
+from tdanet_jax.scenes import floor_plan
+from tdanet_jax.scenes.floor_plan import FloorPlan
+
+#: Height of a line and advance of a letter, in units of the font's size; on the wide side, as the
+#: reader's font is not known.
+LINE, LETTER = 1.15, 0.7
+#: What is left free at the sides of a picture, in the same units.
+MARGIN = 0.3
+_ADVANCE = {
+    **dict.fromkeys("ijlI .,:'", 0.35),
+    **dict.fromkeys("frt-()", 0.45),
+    **dict.fromkeys("mwMW%", 1.0),
+}
+
+Rectangle = tuple[float, float, float, float]  # x1, y1, x2, y2, y down
+
+
+class Label(NamedTuple):
+    """A name that has found a place; x and y are its left upper corner."""
+
+    text: str
+    x: float
+    y: float
+    of: int  # which of the things it belongs to
+
+
+def place(
+    things: Sequence[tuple[str, Rectangle]],
+    size: float,
+    bounds: Rectangle,
+    centred: bool = False,
+    most: int | None = None,
+) -> list[Label]:
+    """Puts names at their rectangles, the first ones first; those without room are left out.
+
+    Args:
+      things: (name, rectangle), most important first.
+      size: of the font, in units of the rectangles.
+      bounds: no name sticks out of these, or touches their sides.
+      centred: names start from the middle of their rectangles instead of the corners.
+      most: how many names at most.
+    """
+    placed: list[Label] = []
+    taken: list[Rectangle] = []
+    margin = MARGIN * size
+    for number, (text, thing) in enumerate(things):
+        if len(placed) == most:
+            break
+        width, height = extent(text, size)
+        spots = _centred if centred else _cornered
+        for left, y in spots(thing, width, height):
+            x = max(min(left, bounds[2] - margin - width), bounds[0] + margin)
+            spot = (x, y, x + width, y + height)
+            if _inside(spot, bounds) and not any(_overlap(spot, other) for other in taken):
+                placed.append(Label(text, x, y, number))
+                taken.append(spot)
+                break
+    return placed
+
+
+def extent(text: str, size: float) -> tuple[float, float]:
+    """Width and height of a name in a font of some size."""
+    return size * sum(_ADVANCE.get(letter, LETTER) for letter in text), LINE * size
+
+
+def _cornered(thing: Rectangle, width: float, height: float) -> Iterable[tuple[float, float]]:
+    x1, y1, x2, y2 = thing
+    above, below = (x1, y1 - height), (x1, y2)
+    if width > x2 - x1 and height > 0.5 * (y2 - y1):  # a name inside would hide the thing
+        yield from (above, below)
+    yield x1, y1
+    yield above
+    yield x1, y2 - height
+    yield below
+    yield x2 - width, y1
+    yield x2 - width, y2 - height
+    yield (x1 + x2 - width) / 2, (y1 + y2 - height) / 2
+    yield x2 - width, y1 - height
+    yield x2 - width, y2
+
+
+def _centred(thing: Rectangle, width: float, height: float) -> Iterable[tuple[float, float]]:
+    x, y = (thing[0] + thing[2] - width) / 2, (thing[1] + thing[3] - height) / 2
+    if width <= thing[2] - thing[0]:
+        for shift in (0, 1, -1, 2, -2):
+            yield x, y + shift * height / 2
+    yield x, thing[3]
+    yield x, thing[1] - height
+    yield x, y
+
+
+def _inside(spot: Rectangle, bounds: Rectangle) -> bool:
+    return (
+        spot[0] >= bounds[0]
+        and spot[1] >= bounds[1]
+        and spot[2] <= bounds[2]
+        and spot[3] <= bounds[3]
+    )
+
+
+def _overlap(a: Rectangle, b: Rectangle) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+#: Size of the names' font as a share of the picture's width.
+VIEW_FONT, PLAN_FONT = 0.034, 0.027
+#: Names in a view, and the least attention (a share) that is told with a name.
+MOST_NAMES, LEAST_ATTENTION = 12, 0.005
+#: Objects of the room that are named on a plan: at least this large, square metres.
+LEAST_AREA = 0.15
+
+
+def of_view(view: View, attention: np.ndarray | None, target: str) -> list[Label]:
+    """Names of the target, of what is most attended to and of the largest; shares of the image.
+
+    Args:
+      attention: [n] weight of each object in view, or None.
+    """
+    boxes = view.boxes
+    size = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    rank = size if attention is None else attention + LEAST_ATTENTION * size
+    order = sorted(range(len(boxes)), key=lambda i: (view.classes[i] != target, -rank[i]))
+    chosen, things = [], []
+    for i in order:
+        text = view.classes[i]
+        if attention is not None and attention[i] >= LEAST_ATTENTION:
+            text += f" {100 * attention[i]:.0f}%"
+        x1, y1, x2, y2 = map(float, boxes[i])
+        chosen.append(i)
+        things.append((text, (x1, y1, x2, y2)))
+    placed = place(things, VIEW_FONT, (0, 0, 1, 1), most=MOST_NAMES)
+    return [label._replace(of=chosen[label.of]) for label in placed]
+
+
+def of_plan(plan: FloorPlan, target: str, scale: float = 1.0) -> list[Label]:
+    """Names of the targets and of the largest object of each class; metres, y is minus z.
+
+    Args:
+      scale: of the font.
+    """
+    x1, z1, x2, z2 = plan.extent
+    order = sorted(range(len(plan.classes)), key=lambda i: plan.classes[i] != target)
+    chosen, things, named = [], [], {"Floor"}
+    for i in order:
+        name, outline = plan.classes[i], plan.outlines[i]
+        if name != target and (name in named or floor_plan.area(outline) < LEAST_AREA):
+            continue
+        named.add(name)
+        (left, low), (right, high) = outline.min(axis=0), outline.max(axis=0)
+        chosen.append(i)
+        things.append((name, (float(left), float(-high), float(right), float(-low))))
+    placed = place(things, scale * plan_font(plan), (x1, -z2, x2, -z1), centred=True)
+    return [label._replace(of=chosen[label.of]) for label in placed]
+
+
+def plan_font(plan: FloorPlan) -> float:
+    """Size of the names on a plan, in metres."""
+    x1, z1, x2, z2 = plan.extent
+    return PLAN_FONT * max(x2 - x1, z2 - z1)

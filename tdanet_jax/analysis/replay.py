@@ -1,0 +1,125 @@
+"""An episode to look at: one HTML page that needs nothing beside itself."""
+
+from __future__ import annotations
+
+import importlib.resources
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from tdanet_jax import poses
+from tdanet_jax.analysis import labels
+from tdanet_jax.analysis.trace import Trace, view
+from tdanet_jax.scenes import floor_plan
+from tdanet_jax.scenes.floor_plan import FloorPlan
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
+
+TEMPLATE = "replay.html"
+#: The place in the template that the episode goes to.
+SLOT = "{{EPISODE}}"
+#: Units of the page's drawings: of the camera's image, and of a metre on the plan.
+IMAGE, METRE = 300, 100
+#: Scale of a plan's font where several players leave it less room.
+SMALL_PLAN = 1.3
+
+
+def page(traces: Sequence[Trace], tables: SceneTables) -> str:
+    """The page for one or several players of the same episode.
+
+    Raises:
+      ValueError: the traces are of different episodes.
+    """
+    first = traces[0]
+    if any((t.pose[0], t.target) != (first.pose[0], first.target) for t in traces):
+        raise ValueError("the traces start in different places or look for different targets")
+    plan = floor_plan.load(tables, first.scene)
+    room = ROOM_TYPES[tables.room_type[tables.scenes.index(first.scene)]]
+    episode = {
+        "scene": first.scene,
+        "room": room.replace("_", " "),
+        "target": first.target,
+        "shortest": first.shortest,
+        "actions": ACTION_NAMES,
+        "plan": _plan(plan, first.target, SMALL_PLAN if len(traces) > 1 else 1.0),
+        "players": [_player(trace, tables) for trace in traces],
+    }
+    template = (
+        importlib.resources.files("tdanet_jax.analysis").joinpath(TEMPLATE).read_text("utf-8")
+    )
+    return template.replace(SLOT, embed(episode))
+
+
+def embed(value: Any) -> str:
+    """JSON that can stand inside a `script` element whatever its strings hold."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    for sign in "<>&":
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    return text
+
+
+def _plan(plan: FloorPlan, target: str, scale: float) -> dict[str, Any]:
+    """The room in centimetres, y down (minus z)."""
+    x1, z1, x2, z2 = plan.extent
+    flip = np.array([METRE, -METRE])
+    return {
+        "extent": [round(METRE * v) for v in (x1, -z2, x2 - x1, z2 - z1)],
+        "font": round(scale * METRE * labels.plan_font(plan), 1),
+        "points": _rounded(plan.points * flip),
+        "outlines": [
+            {"name": name, "corners": _rounded(corners * flip)}
+            for name, corners in zip(plan.classes, plan.outlines, strict=True)
+        ],
+        "labels": [
+            [label.text, round(METRE * label.x), round(METRE * label.y), plan.classes[label.of]]
+            for label in labels.of_plan(plan, target, scale)
+        ],
+    }
+
+
+def _player(trace: Trace, tables: SceneTables) -> dict[str, Any]:
+    return {
+        "name": trace.player,
+        "outcome": trace.outcome,
+        "success": trace.success,
+        "attends": trace.attention is not None,
+        "steps": [_step(trace, tables, i) for i in range(len(trace.pose))],
+    }
+
+
+def _step(trace: Trace, tables: SceneTables, i: int) -> dict[str, Any]:
+    """What the page shows before action i, or at the end, where nothing is decided any more."""
+    pose, last = int(trace.pose[i]), i == len(trace.actions)
+    parts = poses.split(pose)
+    x, _, z = tables.position[parts.position]
+    rotation, horizon = parts.degrees
+    seen = view(tables, pose)
+    weights = None if trace.attention is None or last else trace.attention[i]
+    step: dict[str, Any] = {
+        "place": [round(METRE * float(x)), round(-METRE * float(z))],
+        "rotation": rotation,
+        "horizon": horizon,
+        "boxes": [
+            [name, *_rounded(IMAGE * box), bool(near)]
+            for name, box, near in zip(*seen, strict=True)
+        ],
+        "labels": [
+            [label.text, round(IMAGE * label.x, 1), round(IMAGE * label.y, 1), label.of]
+            for label in labels.of_view(seen, weights, trace.target)
+        ],
+    }
+    if weights is not None:
+        step["attention"] = _rounded(weights, 4)
+    if not last:
+        step["action"] = int(trace.actions[i])
+        for name in ("probabilities", "value", "difference"):
+            values = getattr(trace, name)
+            if values is not None:
+                step[name] = _rounded(values[i], 4)
+    return step
+
+
+def _rounded(values: np.ndarray, digits: int = 1) -> Any:
+    return np.round(np.asarray(values, np.float64), digits).tolist()

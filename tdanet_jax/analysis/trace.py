@@ -1,0 +1,278 @@
+"""An episode step by step: where an agent went, what was in view, and what its network made of it.
+
+A trace is made from actions that were already taken, be it by `evaluation.evaluate` or read from a
+run's `episodes.jsonl`: they lead through the same poses again, and the network is asked at each of
+them, with the memory that it had there. So a recorded episode is shown as it happened.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tdanet_jax import poses
+from tdanet_jax.agent import agent
+from tdanet_jax.analysis import attention
+from tdanet_jax.env import dynamics
+from tdanet_jax.env.dynamics import EnvParams, EnvState
+from tdanet_jax.evaluation import policies, rollout
+from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.evaluation.policies import Policy
+from tdanet_jax.evaluation.rollout import Records
+from tdanet_jax.models import actor_critic
+from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.scenes.dataset import Rooms
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.task import Task, task_in
+from tdanet_jax.vocabulary import NUM_ACTIONS, Action
+
+
+@dataclasses.dataclass(frozen=True)
+class Player:
+    """Who plays: a trained network, or the shortest path if there is no network.
+
+    Attributes:
+      name: what pictures call it.
+      task: the rooms as its configuration shows them.
+      model, weights: the network, or None.
+      greedy: takes the most probable action instead of sampling one.
+    """
+
+    name: str
+    task: Task
+    model: ActorCritic | None = None
+    weights: Any = None
+    greedy: bool = False
+
+    @functools.cached_property
+    def policy(self) -> Policy:
+        """How it chooses its actions; one object, so that it is compiled once."""
+        if self.model is None:
+            return policies.shortest_path()
+        return policies.network(self.model, self.task.words, self.greedy)
+
+    @property
+    def attends(self) -> bool:
+        """Whether the network has weights over the detections."""
+        if self.model is None:
+            return False
+        one, task = jnp.zeros(1, jnp.int32), self.task
+        arguments = (self.weights, task.words, task.eval_params, one, one)
+        shapes = jax.eval_shape(functools.partial(attention.look, self.model), *arguments)
+        return shapes[1].attention is not None
+
+
+def load_player(run: Path | str, rooms: Rooms, greedy: bool = False) -> Player:
+    """The agent of a training run, or of a point of its history, on the given rooms.
+
+    Returns:
+      A player with the name of the run's folder, or of the point.
+
+    Raises:
+      ValueError: the folder holds no run, its checkpoint cannot be read, the network looks at
+        feature maps that the rooms do not have, or it knows classes by number and the rooms have
+        others.
+    """
+    config, weights, classes = agent.read(run)
+    task = task_in(rooms, config)
+    task.check_known(run, classes.names)
+    return Player(Path(run).resolve().name, task, task.model, weights, greedy)
+
+
+@dataclasses.dataclass(frozen=True)
+class Trace:
+    """One player's episode of T actions. What a player does not have is None.
+
+    Attributes:
+      player: its name.
+      scene, target: names.
+      pose: [T + 1] int, before each action and at the end, in the full tables.
+      actions: [T] int.
+      success: Done with the target visible.
+      shortest: L, actions on the optimal path with Done.
+      probabilities: [T, 6], of the actions.
+      value: [T], expected discounted return.
+      attention: T arrays [n], weight of each of the n objects in view, in the tables' order. Where
+        the network sees a row per class, every object of the class has the row's weight.
+      correspondence: the same, before the softmax of Eq. 1.
+      difference: [T], mean over the units of Eq. 2's absolute difference.
+    """
+
+    player: str
+    scene: str
+    target: str
+    pose: np.ndarray
+    actions: np.ndarray
+    success: bool
+    shortest: int
+    probabilities: np.ndarray | None = None
+    value: np.ndarray | None = None
+    attention: tuple[np.ndarray, ...] | None = None
+    correspondence: tuple[np.ndarray, ...] | None = None
+    difference: np.ndarray | None = None
+
+    @property
+    def outcome(self) -> str:
+        """How it ended, in words."""
+        count = len(self.actions)
+        if self.success:
+            how = "success"
+        elif self.actions[-1] == Action.DONE:
+            how = "failure (Done without the target)"
+        else:
+            how = "failure (step limit)"
+        return f"{how}, {count} action{'s'[: count != 1]}, shortest {self.shortest}"
+
+
+class View(NamedTuple):
+    """The n detections from a pose, an object each, in the tables' order."""
+
+    classes: tuple[str, ...]
+    boxes: np.ndarray  # [n, 4] x1, y1, x2, y2 as shares of the image, y down
+    within_reach: np.ndarray  # [n] bool, visible as the task says it: within 1.5 m
+
+
+def view(tables: SceneTables, pose: int) -> View:
+    """What is in view from a pose."""
+    rows = _detected(tables, pose)
+    return View(
+        classes=tuple(tables.classes[c] for c in tables.row_class[rows]),
+        boxes=tables.row_box[rows] / (tables.image * tables.subpixel),
+        within_reach=tables.row_visible[rows],
+    )
+
+
+def _detected(tables: SceneTables, pose: int) -> np.ndarray:
+    """The tables' rows of a pose that are detections; what is visible without a box is none."""
+    rows = np.arange(tables.row_start[pose], tables.row_start[pose + 1])
+    return rows[tables.row_box[rows, 0] >= 0]
+
+
+def play(player: Player, tables: SceneTables, episode: Episodes, seed: int = 0) -> Trace:
+    """Lets the player play one episode to its end. Equal seeds, equal actions."""
+    params, key = player.task.eval_params, jax.random.key(seed)
+    records = rollout.evaluate(player.policy, player.weights, params, episode, key)
+    return retrace(player, tables, episode, records.actions[0, : records.length[0]])
+
+
+def retrace(player: Player, tables: SceneTables, episode: Episodes, actions: np.ndarray) -> Trace:
+    """The trace of actions [T] that were taken in an episode."""
+    pose = follow(player.task.eval_params, episode, actions[None])[0]
+    goal = int(episode.target[0])
+    trace = Trace(
+        player=player.name,
+        scene=tables.scenes[tables.position_scene[poses.split(pose[0]).position]],
+        target=tables.targets[goal],
+        pose=pose,
+        actions=np.asarray(actions, int),
+        success=bool(actions[-1] == Action.DONE and tables.distance[pose[-1], goal] == 0),
+        shortest=int(tables.distance[pose[0], goal]) + 1,
+    )
+    return trace if player.model is None else _think(player, tables, trace, goal)
+
+
+def follow(params: EnvParams, episodes: Episodes, actions: np.ndarray) -> np.ndarray:
+    """Poses [E, N + 1] before each of the actions [E, N] and at the end; -1 is no action."""
+    return np.asarray(_follow(params, jnp.asarray(episodes.pose), jnp.asarray(actions)))
+
+
+@jax.jit
+def _follow(params: EnvParams, pose: jax.Array, actions: jax.Array) -> jax.Array:
+    move = jax.vmap(dynamics.move, (None, 0, 0))
+
+    def step(pose: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        after = jnp.where(action < 0, pose, move(params, pose, action))
+        return after, after
+
+    _, after = jax.lax.scan(step, pose, actions.T)
+    return jnp.concatenate([pose[None], after]).T
+
+
+def visited(
+    params: EnvParams, episodes: Episodes, records: Records
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pose and target [N] of every frame in which an action was chosen."""
+    taken = records.actions >= 0
+    pose = follow(params, episodes, records.actions)[:, :-1][taken]
+    return pose, np.repeat(episodes.target, taken.sum(axis=1))
+
+
+#: Steps are padded to multiples of this, the longest test episode: one shape is compiled.
+STEP_BLOCK = 200
+
+
+def _think(player: Player, tables: SceneTables, trace: Trace, goal: int) -> Trace:
+    """The trace with what the network made of every step."""
+    count = len(trace.actions)
+    padded = np.resize(trace.actions, -(-count // STEP_BLOCK) * STEP_BLOCK)
+    task, pose = player.task, jnp.asarray(trace.pose[0])
+    start = dynamics.start(task.eval_params, pose, jnp.int32(goal))
+    thoughts = _thoughts(player.model, player.weights, task.words, task.eval_params, start, padded)
+    steps = jax.tree.map(lambda x: np.asarray(x, np.float64)[:count], thoughts)
+    rows = [_rows_of_objects(task.eval_params, tables, pose) for pose in trace.pose[:-1]]
+
+    def by_object(values: np.ndarray | None) -> tuple[np.ndarray, ...] | None:
+        if values is None:
+            return None
+        return tuple(value[row] for value, row in zip(values, rows, strict=True))
+
+    return dataclasses.replace(
+        trace,
+        probabilities=steps.probabilities,
+        value=steps.value,
+        attention=by_object(steps.attention),
+        correspondence=by_object(steps.correspondence),
+        difference=steps.difference,
+    )
+
+
+def _rows_of_objects(params: EnvParams, tables: SceneTables, pose: int) -> np.ndarray:
+    """The observation's row of each of the n objects in view: [n] int."""
+    classes = tables.row_class[_detected(tables, pose)]
+    if int(params.row_start[pose + 1] - params.row_start[pose]) == len(classes):
+        return np.arange(len(classes))
+    return np.unique(classes, return_inverse=True)[1]  # rows are one a class, in the same order
+
+
+class _Thoughts(NamedTuple):
+    """What a network makes of each step [N]."""
+
+    probabilities: jax.Array  # [N, 6]
+    value: jax.Array  # [N]
+    attention: jax.Array | None  # [N, K]
+    correspondence: jax.Array | None  # [N, K]
+    difference: jax.Array | None  # [N]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _thoughts(
+    model: ActorCritic,
+    weights: Any,
+    words: jax.Array,
+    params: EnvParams,
+    start: EnvState,
+    actions: jax.Array,
+) -> _Thoughts:
+    table = actor_critic.prepare(model, weights, words)
+
+    def step(memory: tuple, action: jax.Array) -> tuple[tuple, _Thoughts]:
+        state, carry, previous, fresh = memory
+        obs = jax.tree.map(lambda x: x[None], dynamics.observe(state, params))
+        carry, out, look = attention.forward(model, weights, table, carry, obs, previous, fresh)
+        probabilities = jax.nn.softmax(out.logits)
+        difference = None if look.difference is None else look.difference.mean(-1)
+        thoughts = _Thoughts(
+            probabilities, out.value, look.attention, look.correspondence, difference
+        )
+        state = dynamics.transition(state, action, params).state
+        memory = state, carry, probabilities, jnp.zeros_like(fresh)
+        return memory, jax.tree.map(lambda x: x[0], thoughts)
+
+    carry, previous = model.initial_carry(1, weights), jnp.zeros((1, NUM_ACTIONS))
+    return jax.lax.scan(step, (start, carry, previous, jnp.ones(1, bool)), actions)[1]

@@ -1,0 +1,1 @@
+"""Policies on fixed episodes, metrics, and reports."""

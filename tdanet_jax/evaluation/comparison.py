@@ -1,0 +1,316 @@
+"""Results of several networks side by side: rows of runs, means over seeds, learning curves.
+
+A result is the content of a `results.json`, a plain dictionary; `saved.Evaluated.results` adds
+where in its run the network was, and the run's settings.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tdanet_jax.config import TrainConfig
+from tdanet_jax.evaluation import metrics, paper
+from tdanet_jax.evaluation.metrics import BUCKETS
+from tdanet_jax.vocabulary import GROUPS
+
+Result = Mapping[str, Any]
+#: The records of a network by group, as the columns of `report.columns`.
+Columns = Mapping[str, Mapping[str, np.ndarray]]
+MEASURES = ("SR", "SPL")
+#: Flags that let an agent sense what the paper's do not.
+BEYOND = ("--odometry", "--triangulation")
+#: Flags that make no other agent: the seed, which distinguishes repetitions, and what only says
+#: how often something is looked at or kept.
+NOT_SETTINGS = ("--seed", "--chunk-updates", "--checkpoint-minutes", "--history", "--max-skipped")
+
+
+class Spread(NamedTuple):
+    """A mean over seeds; `sd` is the deviation of single seeds, None for one seed."""
+
+    mean: float
+    sd: float | None
+
+    def __str__(self) -> str:
+        return f"{self.mean:.1f}" if self.sd is None else f"{self.mean:.1f} ± {self.sd:.1f}"
+
+
+def flags(config: TrainConfig) -> dict[str, Any]:
+    """A configuration's values by flag: --num-envs 256."""
+    return dict(_flags(dataclasses.asdict(config)))
+
+
+def _flags(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flags(value)
+        else:
+            yield f"--{name.replace('_', '-')}", value
+
+
+def settings(config: TrainConfig) -> dict[str, Any]:
+    """The flags in which repetitions of a run must agree."""
+    return {flag: value for flag, value in flags(config).items() if flag not in NOT_SETTINGS}
+
+
+class _Kind(NamedTuple):
+    """What repetitions of a run agree in."""
+
+    model: str
+    split: str
+    values: tuple[tuple[str, Any], ...]  # by flag, where there is one
+
+
+def _kind(result: Result) -> _Kind:
+    values = {
+        **result.get("settings", {}),
+        "--policy": result["policy"],
+        "scene tables": result["data_version"],
+    }
+    for flag in ("--model", "--split", "--validation"):  # the model and the split say these
+        values.pop(flag, None)
+    return _Kind(result["model"], result["split"], tuple(values.items()))
+
+
+def labels(results: Sequence[Result], names: Sequence[str]) -> list[str]:
+    """A label for each result: the same for those that differ in the seed alone.
+
+    It is the model's name and the values in which the results of that model differ; what an agent
+    senses that the paper's do not is always said. Results that repeat a seed are no sample of
+    seeds: each has its name behind the label.
+
+    Args:
+      results: with their runs' `settings`; without any where nothing was trained.
+      names: one for each result; points of one run share one.
+    """
+    kinds = [_kind(result) for result in results]
+    counts = Counter((kind, result["seed"]) for kind, result in zip(kinds, results, strict=True))
+    repeated = {kind for (kind, _), count in counts.items() if count > 1}
+    out = []
+    for kind, name in zip(kinds, names, strict=True):
+        rivals = [dict(other.values) for other in kinds if other.model == kind.model]
+        differing = [
+            _shown(flag, value)
+            for flag, value in kind.values
+            if (flag in BEYOND and value) or any(rival.get(flag) != value for rival in rivals)
+        ]
+        out.append(", ".join([kind.model, *differing, *([name] if kind in repeated else [])]))
+    return out
+
+
+def _shown(flag: str, value: Any) -> str:
+    if value is None or value is False:
+        return f"no {flag}"
+    return flag if value is True else f"{flag} {value}"
+
+
+def spread(values: Iterable[float | None]) -> Spread | None:
+    """Mean and deviation of what is not None; None if nothing is left."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    return Spread(statistics.fmean(known), statistics.stdev(known) if len(known) > 1 else None)
+
+
+def summary(results: Sequence[Result]) -> dict[str, Any]:
+    """Means and deviations over seeds: group -> bucket -> measure, and the same by room type."""
+    rooms = dict.fromkeys(room for result in results for room in result["by_room"])
+    return {
+        "seeds": [result["seed"] for result in results],
+        "episodes_trained": spread(result["episodes_trained"] for result in results),
+        **_groups(results),
+        "by_room": {
+            room: _groups([r["by_room"][room] for r in results if room in r["by_room"]])
+            for room in rooms
+        },
+    }
+
+
+def _groups(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for group in GROUPS:
+        found = [part[group] for part in parts if part.get(group) is not None]
+        out[group] = {
+            bucket: {
+                measure: spread(part[bucket][measure] for part in found) for measure in MEASURES
+            }
+            for bucket in BUCKETS
+        } if found else None  # fmt: skip
+    return out
+
+
+def with_differences(results: Sequence[Result], played: Sequence[Columns]) -> list[Result]:
+    """Results with their `difference` to the first of the same episodes, group by group.
+
+    It is None for that first one itself. Otherwise `to` is the other's run; a group holds ours
+    minus theirs, as `metrics.difference` says it.
+
+    Args:
+      results: as `saved.Evaluated.results` gives them.
+      played: the records behind each.
+    """
+    out: list[Result] = []
+    for i, result in enumerate(results):
+        first = next(j for j in range(i + 1) if _same_episodes(results, played, i, j))
+        difference = None if first == i else {
+            "to": results[first]["run"],
+            **{
+                group: metrics.difference(played[i][group], played[first][group])
+                if group in played[i] else None
+                for group in GROUPS
+            },
+        }  # fmt: skip
+        out.append({**result, "difference": difference})
+    return out
+
+
+def _same_episodes(
+    results: Sequence[Result], played: Sequence[Columns], one: int, other: int
+) -> bool:
+    """Whether two networks began at the same points of the same rooms, for the same targets."""
+    ours, theirs = played[one], played[other]
+    return (
+        all(results[one][name] == results[other][name] for name in ("split", "data_version"))
+        and ours.keys() == theirs.keys()
+        and all(
+            np.array_equal(ours[group][name], theirs[group][name])
+            for group in ours
+            for name in ("scene", "target", "x", "z", "rotation", "horizon")
+        )
+    )
+
+
+def table(
+    first: Sequence[str], rows: Iterable[tuple[Sequence[str], Mapping[str, Any]]]
+) -> list[str]:
+    """A table in the paper's form: SR and SPL of seen and unseen targets, L >= 1 and L >= 5.
+
+    Args:
+      first: headings of the columns before the figures.
+      rows: the cells of these columns, and group -> bucket -> measure -> anything that prints.
+    """
+    names = [f"{g} {m} {b}" for g in GROUPS for b in BUCKETS for m in MEASURES]
+    heads = [*first, *names]
+    lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
+    for cells, groups in rows:
+        figures = [
+            _cell(((groups.get(group) or {}).get(bucket) or {}).get(measure))
+            for group in GROUPS
+            for bucket in BUCKETS
+            for measure in MEASURES
+        ]
+        lines.append(f"| {' | '.join([*cells, *figures])} |")
+    return lines
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.1f}" if isinstance(value, float) else str(value)
+
+
+def paper_rows(split: str) -> dict[str, dict[str, Any]]:
+    """The paper's agents on a split: name -> group -> bucket -> measure."""
+    out: dict[str, dict[str, Any]] = {}
+    for group in GROUPS:
+        for agent, rates in paper.rates(split, group):
+            out.setdefault(agent, {})[group] = {
+                bucket: {"SR": rate.sr, "SPL": rate.spl} for bucket, rate in rates.items()
+            }
+    return out
+
+
+def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
+    """A page about several networks: a row for each, means over seeds, the paper's rows.
+
+    Args:
+      results: as `saved.Evaluated.results` gives them.
+      runs: a short name for each; points of one run, which have no mean, share one.
+    """
+    lines = [f"# {title}", "", "SR and SPL in percent, test rooms."]
+    for split in dict.fromkeys(result["split"] for result in results):
+        own = [result for result in results if result["split"] == split]
+        names = [run for run, r in zip(runs, results, strict=True) if r["split"] == split]
+        rows: list[_Row] = [
+            ((run, f"{r['updates']:,}", f"{r['episodes_trained']:,}", r["policy"]), r)
+            for run, r in zip(names, own, strict=True)
+        ]
+        rows += (differing := list(_differences(own, names)))
+        rows += _means(own, names)
+        for agent, groups in paper_rows(split).items():
+            rows.append(((f"{agent} (paper)", "", "", ""), groups))
+        lines += ["", f"## Split {split}", ""]
+        lines += table(("Agent", "Updates", "Training episodes", "Actions"), rows)
+        if differing:
+            lines += ["", "Differences: in the same episodes, 95 % intervals (paired bootstrap)."]
+        if paper_rows(split):
+            worlds = dict.fromkeys(paper.worlds(result["data"]) for result in own)
+            lines += ["", *worlds]
+    return "\n".join(lines) + "\n"
+
+
+_Row = tuple[Sequence[str], Mapping[str, Any]]
+
+
+def _differences(results: Sequence[Result], names: Sequence[str]) -> Iterator[_Row]:
+    """A row for every network with a difference to another."""
+    for result, name in zip(results, names, strict=True):
+        if (difference := result.get("difference")) is None:
+            continue
+        to = next(n for r, n in zip(results, names, strict=True) if r["run"] == difference["to"])
+        groups = {
+            group: {
+                bucket: {measure: metrics.shown(part, measure) for measure in MEASURES}
+                for bucket, part in difference[group].items()
+            }
+            for group in GROUPS
+            if difference[group] is not None
+        }
+        yield (f"{name} minus {to}", "", "", result["policy"]), groups
+
+
+def _means(results: Sequence[Result], names: Sequence[str]) -> Iterator[_Row]:
+    """A row for every label that several seeds share; none among the points of histories."""
+    if len(set(names)) < len(names):
+        return
+    together: dict[str, list[Result]] = {}
+    for label, result in zip(labels(results, names), results, strict=True):
+        together.setdefault(label, []).append(result)
+    for label, seeds in together.items():
+        if len(seeds) > 1:
+            yield (f"**{label}, {len(seeds)} seeds**", "", "", seeds[0]["policy"]), summary(seeds)
+
+
+class Curve(NamedTuple):
+    """A learning curve: means over seeds at each point, and how far single seeds lie from them."""
+
+    label: str
+    episodes: list[float]  # training episodes, mean over seeds
+    values: dict[tuple[str, str], list[Spread | None]]  # by group and measure, L >= 1
+
+
+def curve(label: str, runs: Sequence[Sequence[Result]]) -> Curve:
+    """The curve of one or several seeds, from the results of their histories.
+
+    Only the points of the budget that every seed has are taken.
+    """
+    by_share = [{result["share"]: result for result in run} for run in runs]
+    common = sorted(set.intersection(*(set(points) for points in by_share)))
+    at = [[points[share] for points in by_share] for share in common]
+    return Curve(
+        label=label,
+        episodes=[statistics.fmean(r["episodes_trained"] for r in seeds) for seeds in at],
+        values={
+            (group, measure): [
+                spread(r[group]["L>=1"][measure] for r in seeds if r[group] is not None)
+                for seeds in at
+            ]
+            for group in GROUPS
+            for measure in MEASURES
+        },
+    )

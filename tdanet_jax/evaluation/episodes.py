@@ -1,0 +1,163 @@
+"""Fixed lists of evaluation episodes, committed as integers with the hash of their tables."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tdanet_jax import poses
+from tdanet_jax.io import assets
+from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.vocabulary import GROUPS, ROOM_TYPES, UNSEEN, Split, make_split
+
+ASSET = "episodes.npz"
+EPISODES_PER_ROOM_TYPE = 250
+#: Seed of the lists; they change only with the tables.
+LIST_SEED = 20240413
+
+
+@dataclasses.dataclass(frozen=True)
+class Episodes:
+    """Starts and targets of E episodes.
+
+    Attributes:
+      pose: [E] int32, start pose in the full tables.
+      target: [E] int32, index among the tables' targets.
+    """
+
+    pose: np.ndarray
+    target: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+
+def draw(
+    tables: SceneTables,
+    scenes: Sequence[str],
+    targets: Mapping[str, Sequence[str]],
+    per_room_type: int,
+    seed: int,
+) -> Episodes:
+    """Draws episodes as training does: scene, target and start uniform, each given the one before.
+
+    A target is drawn among those of the room type that can be reached in the scene from somewhere,
+    a start among the positions that can reach it, its rotation among the eight; the horizon is 0.
+    """
+    rng = np.random.default_rng(seed)
+    index = {name: i for i, name in enumerate(tables.scenes)}
+    reachable = tables.reachable
+    starts, goals = [], []
+    for room in ROOM_TYPES:
+        options = []
+        for scene in scenes:
+            if ROOM_TYPES[tables.room_type[index[scene]]] != room:
+                continue
+            positions = np.flatnonzero(tables.position_scene == index[scene])
+            found = [tables.targets.index(name) for name in targets.get(room, ())]
+            found = [goal for goal in found if reachable[positions, goal].any()]
+            if found:
+                options.append((positions, found))
+        for _ in range(per_room_type if options else 0):
+            positions, found = options[rng.integers(len(options))]
+            goal = found[rng.integers(len(found))]
+            valid = positions[reachable[positions, goal]]
+            position = valid[rng.integers(len(valid))]
+            starts.append(poses.join(position, rng.integers(poses.ROTATIONS)))
+            goals.append(goal)
+    return Episodes(np.array(starts, np.int32), np.array(goals, np.int32))
+
+
+def draw_split(tables: SceneTables, split: Split) -> dict[str, Episodes]:
+    """The seen and the unseen list of a split; a split without unseen classes has none."""
+    lists = {}
+    for group, targets in zip(GROUPS, (split.seen, split.unseen), strict=True):
+        if any(targets.values()):
+            seed = LIST_SEED + GROUPS.index(group)
+            lists[group] = draw(tables, split.eval_scenes, targets, EPISODES_PER_ROOM_TYPE, seed)
+    return lists
+
+
+def build_asset(tables: SceneTables, out_dir: Path) -> Path:
+    """Writes the lists of every published split, and of its validation, for these tables."""
+    arrays = {"data_version": np.frombuffer(tables.data_version.encode(), np.uint8)}
+    for name in UNSEEN:
+        for validation in (False, True):
+            split = make_split(name, validation)
+            for group, episodes in draw_split(tables, split).items():
+                arrays[f"{split.name}/{group}/pose"] = episodes.pose
+                arrays[f"{split.name}/{group}/target"] = episodes.target
+    np.savez(out_dir / ASSET, **arrays)  # type: ignore[arg-type]
+    return out_dir / ASSET
+
+
+def load(tables: SceneTables, split: Split, extras: Extras | None = None) -> dict[str, Episodes]:
+    """The lists of a split: group -> episodes.
+
+    Those of the published splits in the bundled rooms are committed; those of other splits are
+    drawn in the same way. Imported rooms have the published ones that came with them; a group of
+    which none can be solved, and all of rooms without any, are drawn. What is drawn is the same
+    every time.
+
+    Args:
+      extras: what came with imported rooms; None with the bundled ones.
+
+    Raises:
+      ValueError: the committed lists belong to other tables, or nothing can be evaluated.
+    """
+    if extras is None:
+        return _committed(tables, split) or draw_split(tables, split)
+    lists = draw_split(tables, split) | published(tables, split, extras.episodes)
+    lists = {group: episodes for group, episodes in lists.items() if len(episodes)}
+    if "seen" not in lists:
+        raise ValueError(f"no seen target of split {split.name} can be reached in its test rooms")
+    return lists
+
+
+def published(
+    tables: SceneTables, split: Split, listed: Sequence[PublishedEpisode]
+) -> dict[str, Episodes]:
+    """The published test episodes of a split's evaluation rooms, by group; none for a group
+    without any. Episodes whose target the start cannot reach are left out."""
+    scenes = {name: i for i, name in enumerate(tables.scenes) if name in split.eval_scenes}
+    lists: dict[str, Episodes] = {}
+    for group, targets in zip(GROUPS, (split.seen, split.unseen), strict=True):
+        starts, goals = [], []
+        for episode in listed:
+            scene = scenes.get(episode.scene)
+            if scene is None or episode.part != "test":
+                continue
+            if episode.target not in targets.get(ROOM_TYPES[tables.room_type[scene]], ()):
+                continue
+            goal = tables.targets.index(episode.target)
+            pose = tables.nearest_state(
+                scene, episode.x, episode.z, episode.rotation, episode.horizon
+            )
+            if tables.distance[pose, goal] >= 0:
+                starts.append(pose)
+                goals.append(goal)
+        if starts:
+            lists[group] = Episodes(np.array(starts, np.int32), np.array(goals, np.int32))
+    return lists
+
+
+def _committed(tables: SceneTables, split: Split) -> dict[str, Episodes]:
+    """The committed lists of a split, which are drawn from these tables; none of other splits."""
+    with np.load(assets.path(ASSET), allow_pickle=False) as data:
+        version = bytes(data["data_version"]).decode()
+        if version != tables.data_version:
+            raise ValueError(
+                f"{ASSET} belongs to scene tables {version}, these are {tables.data_version}: "
+                "reinstall tdanet_jax, or run `python -m experiments.scenes build`"
+            )
+        return {
+            group: Episodes(
+                data[f"{split.name}/{group}/pose"], data[f"{split.name}/{group}/target"]
+            )
+            for group in GROUPS
+            if f"{split.name}/{group}/pose" in data
+        }

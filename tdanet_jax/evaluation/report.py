@@ -1,0 +1,268 @@
+"""What a run reports: `results.json`, `results.md` and one record per episode."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.resources
+import json
+import subprocess
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import tdanet_jax
+from tdanet_jax import poses
+from tdanet_jax.evaluation import paper
+from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.evaluation.metrics import BUCKETS, grouped, shown, summarise
+from tdanet_jax.evaluation.rollout import Records
+from tdanet_jax.io import files
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS, GROUPS, ROOM_TYPES
+
+RESULTS_VERSION = 1
+#: What an evaluation writes into its folder; `RESULTS_FILE` comes last.
+RESULTS_FILE, RESULTS_PAGE, EPISODES_FILE = "results.json", "results.md", "episodes.jsonl"
+
+#: Targets with a near-synonym among the classes that no split hides: those of like meaning whose
+#: bundled word vectors have a cosine of at least 0.84.
+NEAR_SYNONYMS = {
+    "Television": ("TVStand",),
+    "ArmChair": ("Chair",),
+    "DeskLamp": ("FloorLamp",),
+    "ToiletPaper": ("ToiletPaperHanger", "PaperTowelRoll"),
+    "SoapBar": ("SoapBottle",),
+    "Towel": ("HandTowel",),
+    "SprayBottle": ("Bottle",),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Provenance:
+    """Where a result comes from; the fields of `results.json` that are not numbers of it.
+
+    Attributes:
+      split, model: what was trained.
+      policy: how actions were chosen.
+      episodes_trained, steps: training episodes and environment steps.
+      seed: of the training; of policies without training, that of the evaluation.
+      evaluation_seed: with which actions were sampled in the test episodes.
+      data_version: of the scene tables that it was evaluated on.
+      data: file of their rooms, where they are not the bundled ones.
+      image: what the model sees, if it looks at an image.
+      odometry: whether it senses its own way, which the paper's agents do not.
+      triangulation: whether it senses its target's place, which they do not, either.
+    """
+
+    split: str
+    model: str
+    policy: str
+    episodes_trained: int
+    seed: int
+    evaluation_seed: int
+    steps: int
+    data_version: str
+    data: str | None = None
+    image: str | None = None
+    odometry: bool = False
+    triangulation: bool = False
+
+
+def agent_name(model: str, odometry: bool, triangulation: bool) -> str:
+    """A model's name, and what it senses that the paper's agents do not."""
+    senses = {"--odometry": odometry, "--triangulation": triangulation}
+    return ", ".join([model, *(flag for flag, on in senses.items() if on)])
+
+
+def columns(tables: SceneTables, episodes: Episodes, records: Records) -> dict[str, np.ndarray]:
+    """Records as named columns of length E, with names in place of indices."""
+    pose = poses.split(episodes.pose)
+    rotation, horizon = pose.degrees
+    scene = tables.position_scene[pose.position]
+    return {
+        "scene": np.array(tables.scenes)[scene],
+        "room": np.array(ROOM_TYPES)[tables.room_type[scene]],
+        "target": np.array(tables.targets)[episodes.target],
+        "x": tables.position[pose.position, 0],
+        "z": tables.position[pose.position, 2],
+        "rotation": rotation,
+        "horizon": horizon,
+        "shortest": records.shortest,
+        "length": records.length,
+        "success": records.success,
+        "cluster": scene.astype(np.int64) * len(tables.targets) + episodes.target,
+    }
+
+
+def results(provenance: Provenance, groups: Mapping[str, Mapping[str, np.ndarray]]) -> dict:
+    """The content of `results.json`, from the columns of each group."""
+
+    def by(key: str, names: tuple[str, ...]) -> dict:
+        split = {group: grouped(c, key, names) for group, c in groups.items()}
+        found = (name for name in names if any(name in parts for parts in split.values()))
+        return {
+            name: {group: parts[name] for group, parts in split.items() if name in parts}
+            for name in found
+        }
+
+    origin = dataclasses.asdict(provenance)
+    return {
+        "version": RESULTS_VERSION,
+        **{name: origin.pop(name) for name in _HEAD},
+        **{name: _summary(groups[name]) if name in groups else None for name in GROUPS},
+        "by_room": by("room", ROOM_TYPES),
+        "by_target": by("target", ALL_TARGETS),
+        **origin,
+        "commit": code_version(),
+    }
+
+
+def _summary(column: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+    return summarise(*(column[name] for name in ("success", "shortest", "length", "cluster")))
+
+
+#: What `results.json` begins with.
+_HEAD = ("split", "model", "policy", "episodes_trained")
+
+
+def code_version() -> str:
+    """The commit of the checkout that the code runs from, else the package's version."""
+    here = Path(str(importlib.resources.files(tdanet_jax))).parent
+    if (here / ".git").exists():
+        command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            return done.stdout.strip()
+    return tdanet_jax.__version__
+
+
+def episode_rows(
+    group: str, column: Mapping[str, np.ndarray], records: Records
+) -> list[dict[str, Any]]:
+    """One plain record per episode; L and e as in the paper, both with Done."""
+    rows = []
+    for i in range(len(records.length)):
+        taken = records.actions[i, : records.length[i]]
+        rows.append(
+            {
+                "group": group,
+                **{k: str(column[k][i]) for k in ("scene", "room", "target")},
+                **{k: float(column[k][i]) for k in ("x", "z")},
+                **{k: int(column[k][i]) for k in ("rotation", "horizon")},
+                "L": int(records.shortest[i]),
+                "e": int(records.length[i]),
+                "success": bool(records.success[i]),
+                "actions": [ACTION_NAMES[a] for a in taken],
+            }
+        )
+    return rows
+
+
+def write(
+    folder: Path,
+    provenance: Provenance,
+    tables: SceneTables,
+    played: Mapping[str, tuple[Episodes, Records]],
+) -> dict:
+    """Writes `results.json`, `results.md` and `episodes.jsonl`; returns the results.
+
+    The folder is made if need be.
+    """
+    groups = {name: columns(tables, *pair) for name, pair in played.items()}
+    out = results(provenance, groups)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_rows(folder, all_rows(tables, played))
+    files.write_text(folder / RESULTS_PAGE, markdown(out, groups))
+    # The last file, and whole: where it is, the others are.
+    files.write_text(folder / RESULTS_FILE, json.dumps(out, indent=2) + "\n")
+    return out
+
+
+def write_rows(folder: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Writes `episodes.jsonl`."""
+    with files.replacing(folder / EPISODES_FILE) as fresh, fresh.open("w") as file:
+        file.writelines(json.dumps(row) + "\n" for row in rows)
+
+
+def all_rows(
+    tables: SceneTables, played: Mapping[str, tuple[Episodes, Records]]
+) -> Iterator[dict[str, Any]]:
+    """The records of every group."""
+    for name, (episodes, records) in played.items():
+        yield from episode_rows(name, columns(tables, episodes, records), records)
+
+
+def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarray]]) -> str:
+    """`results.md`: the tables of the paper's form, with the paper's rows beside ours."""
+    agent = agent_name(out["model"], out["odometry"], out["triangulation"])
+    lines = [
+        f"# {agent}, split {out['split']}, seed {out['seed']}",
+        "",
+        f"{out['episodes_trained']:,} training episodes, {out['steps']:,} environment steps; "
+        f"{out['policy']} actions, evaluation seed {out['evaluation_seed']}; scene tables "
+        f"{out['data_version']}, code {out['commit']}.",
+        *(f"{name.capitalize()}: {out[name]}." for name in ("data", "image") if out[name]),
+        "",
+        "SR and SPL in percent, with 95 % bootstrap intervals over (room, target) pairs.",
+        "",
+        *_header("Targets", "Agent"),
+    ]
+    for group in GROUPS:
+        if out[group] is None:
+            continue
+        lines.append(_row((group, f"**{agent} (ours)**"), out[group]))
+        lines += [_paper_row(group, *row) for row in paper.rates(out["split"], group)]
+    if any(rate.split == out["split"] for rate in paper.RATES):
+        lines += ["", paper.worlds(out["data"])]
+    if "unseen" in groups and (apart := _near_synonyms(groups["unseen"])):
+        known = "; ".join(
+            f"{name}: {', '.join(like)}"
+            for name, like in NEAR_SYNONYMS.items()
+            if name in groups["unseen"]["target"]
+        )
+        lines += ["", f"Unseen classes with a near-synonym known in training ({known}) apart:"]
+        lines += ["", *_header("Targets", "Classes"), *apart]
+    lines.append("")
+    for group, column in groups.items():
+        share = 100 * float((column["shortest"] == 1).mean())
+        lines.append(f"Target in view at the start (L = 1), {group}: {share:.1f} % of episodes.")
+    for title, key in (("Room", "by_room"), ("Target", "by_target")):
+        lines += ["", f"## By {title.lower()}", "", *_header(title, "Group")]
+        for name, parts in out[key].items():
+            lines += [_row((name, group), buckets) for group, buckets in parts.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _near_synonyms(column: Mapping[str, np.ndarray]) -> list[str]:
+    """Rows for the unseen classes with and without a near-synonym known in training."""
+    like = np.isin(column["target"], list(NEAR_SYNONYMS))
+    present = sorted(set(column["target"][like].tolist()))
+    lines = []
+    for chosen, title in ((like, ", ".join(present)), (~like, f"without {', '.join(present)}")):
+        if like.any() and chosen.any():
+            part = {name: values[chosen] for name, values in column.items()}
+            lines.append(_row(("unseen", title), _summary(part)))
+    return lines
+
+
+def _header(*first: str) -> list[str]:
+    names = [*first, *(f"{m} {bucket}" for bucket in BUCKETS for m in ("SR", "SPL", "n"))]
+    return [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"]
+
+
+def _row(first: tuple[str, ...], buckets: Mapping[str, Mapping[str, Any]]) -> str:
+    cells = [*first]
+    for bucket in BUCKETS:
+        part = buckets[bucket]
+        cells += [shown(part, "SR"), shown(part, "SPL"), str(part["n"])]
+    return f"| {' | '.join(cells)} |"
+
+
+def _paper_row(group: str, agent: str, rates: Mapping[str, paper.Rate]) -> str:
+    cells = [group, f"{agent} (paper)"]
+    for bucket in BUCKETS:
+        rate = rates.get(bucket)
+        cells += ["-", "-", ""] if rate is None else [f"{rate.sr:.1f}", f"{rate.spl:.1f}", ""]
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,150 @@
+"""Runs a policy on a fixed list of episodes, in one compiled call."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tdanet_jax.env import dynamics
+from tdanet_jax.env.dynamics import EnvParams
+from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.evaluation.policies import Policy
+
+
+@dataclasses.dataclass(frozen=True)
+class Records:
+    """What happened in each of E episodes.
+
+    Attributes:
+      shortest: [E] int32, L, actions on the optimal path with Done.
+      length: [E] int32, e, actions taken with Done.
+      success: [E] bool, Done while an instance of the target was visible.
+      actions: [E, N] int8, actions taken; -1 behind the last, N the largest step limit.
+    """
+
+    shortest: np.ndarray
+    length: np.ndarray
+    success: np.ndarray
+    actions: np.ndarray
+
+
+def evaluate(
+    policy: Policy, weights: Any, params: EnvParams, episodes: Episodes, key: jax.Array
+) -> Records:
+    """Lets `policy` play every episode to its end. One compiled call; equal keys, equal records."""
+    limit = int(np.max(np.asarray(params.step_limit)))
+    pose, target = jnp.asarray(episodes.pose), jnp.asarray(episodes.target)
+    out = jax.device_get(_play(policy, limit, weights, params, pose, target, key))
+    return Records(*out)
+
+
+def evaluate_lists(
+    policy: Policy, weights: Any, params: EnvParams, lists: Mapping[str, Episodes], seed: int
+) -> dict[str, tuple[Episodes, Records]]:
+    """`evaluate` on every list of a split, each with a random stream of its own."""
+    key = jax.random.key(seed)
+    return {
+        group: (chosen, evaluate(policy, weights, params, chosen, jax.random.fold_in(key, i)))
+        for i, (group, chosen) in enumerate(lists.items())
+    }
+
+
+def evaluate_stacked(
+    policy: Policy,
+    weights: Any,
+    params: EnvParams,
+    lists: Mapping[str, Episodes],
+    seed: int | Sequence[int],
+    batched: bool | None = None,
+) -> list[dict[str, tuple[Episodes, Records]]]:
+    """`evaluate_lists` of W networks in one compiled call a list.
+
+    Args:
+      weights: parameters stacked, each leaf [W, ...].
+      seed: of all, or one for each [W].
+      batched: whether the networks play side by side or one after the other. None does what is
+        faster: side by side on an accelerator; on a processor, whose products are large enough
+        already, one after the other.
+
+    Returns:
+      What `evaluate_lists` gives for each network. Equal seeds, equal random streams.
+    """
+    if batched is None:
+        batched = jax.default_backend() != "cpu"
+    limit = int(np.max(np.asarray(params.step_limit)))
+    count = len(jax.tree.leaves(weights)[0])
+    key = jax.vmap(jax.random.key)(np.broadcast_to(np.asarray(seed, np.uint32), count))
+    out: dict[str, list[Records]] = {}
+    for i, (group, chosen) in enumerate(lists.items()):
+        pose, target = jnp.asarray(chosen.pose), jnp.asarray(chosen.target)
+        own = jax.vmap(jax.random.fold_in, (0, None))(key, i)
+        played = jax.device_get(
+            _play_each(policy, limit, batched, weights, params, pose, target, own)
+        )
+        out[group] = [Records(*one) for one in zip(*played, strict=True)]
+    return [{group: (lists[group], out[group][w]) for group in lists} for w in range(count)]
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _play_each(
+    policy: Policy,
+    limit: int,
+    batched: bool,
+    weights: Any,
+    params: EnvParams,
+    pose: jax.Array,
+    target: jax.Array,
+    key: jax.Array,
+) -> tuple[jax.Array, ...]:
+    def play(one: tuple[Any, jax.Array]) -> tuple[jax.Array, ...]:
+        own, stream = one
+        out: tuple[jax.Array, ...] = _play(policy, limit, own, params, pose, target, stream)
+        return out
+
+    each = weights, key
+    return jax.vmap(play)(each) if batched else jax.lax.map(play, each)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _play(
+    policy: Policy,
+    limit: int,
+    weights: Any,
+    params: EnvParams,
+    pose: jax.Array,
+    target: jax.Array,
+    key: jax.Array,
+) -> tuple[jax.Array, ...]:
+    count = pose.shape[0]
+    transition = jax.vmap(dynamics.transition, (0, 0, None))
+    state = jax.vmap(dynamics.start, (None, 0, 0))(params, pose, target)
+
+    def unfinished(loop: tuple) -> jax.Array:
+        step, _, _, alive, _, _ = loop
+        return (step < limit) & jnp.any(alive)
+
+    def body(loop: tuple) -> tuple:
+        step, state, memory, alive, success, actions = loop
+        memory, action = policy.act(weights, memory, jax.random.fold_in(key, step), state, params)
+        out = transition(state, action, params)
+        state = dynamics.choose(alive, out.state, state)
+        actions = actions.at[:, step].set(jnp.where(alive, action, -1).astype(jnp.int8))
+        success = success | (alive & out.success)
+        return step + 1, state, memory, alive & ~out.terminated & ~out.truncated, success, actions
+
+    loop = (
+        jnp.zeros((), jnp.int32),
+        state,
+        policy.start(weights, count),
+        jnp.ones(count, bool),
+        jnp.zeros(count, bool),
+        jnp.full((count, limit), -1, jnp.int8),
+    )
+    _, state, _, _, success, actions = jax.lax.while_loop(unfinished, body, loop)
+    return state.shortest, state.steps, success, actions

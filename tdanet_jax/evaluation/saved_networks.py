@@ -1,0 +1,216 @@
+"""Networks that training runs have saved: found on disk, and evaluated together.
+
+Networks of one shape and task are stacked and played in one compiled call, so that the learning
+curve of a run's whole history costs one compilation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tdanet_jax import config as configs
+from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.evaluation import comparison, episodes, policies, report, rollout
+from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.evaluation.rollout import Records
+from tdanet_jax.models import classes
+from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
+from tdanet_jax.task import Task, load_task
+from tdanet_jax.training import history
+from tdanet_jax.training.checkpoint import Checkpoints, is_passed_on, newest
+from tdanet_jax.training.history import Snapshot
+
+#: Networks in one call; bounds the memory that a long list takes.
+TOGETHER = 20
+
+Played = Mapping[str, tuple[Episodes, Records]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Saved:
+    """A network on disk.
+
+    Attributes:
+      run: its run's folder.
+      config: its run's configuration.
+      point: a file of the run's history, or None for its newest network.
+      data: file of rooms to evaluate in; None for those of its training.
+    """
+
+    run: Path
+    config: TrainConfig
+    point: Path | None = None
+    data: str | None = None
+
+    @property
+    def rooms(self) -> str | None:
+        """File of the rooms that it is evaluated in; None for the bundled ones."""
+        return self.config.data if self.data is None else self.data
+
+    def load(self) -> Snapshot:
+        """Reads it. Raises ValueError if it cannot be read."""
+        return newest(self.run) if self.point is None else history.read(self.point)
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluated:
+    """A saved network, what it was, and what it did.
+
+    Attributes:
+      saved: where it is.
+      snapshot: where its run was; without the weights.
+      task: what it was evaluated on.
+      provenance: the head of its results.
+      played: its episodes by group.
+    """
+
+    saved: Saved
+    snapshot: Snapshot
+    task: Task
+    provenance: report.Provenance
+    played: Played
+
+    def results(self) -> dict:
+        """The content of a `results.json`, after the run's folder and where the run was; the run's
+        settings behind it. `point` and `share` are None where it is no point of a history."""
+        point = None if self.saved.point is None else self.snapshot.point
+        return {
+            "run": str(self.saved.run),
+            "point": point,
+            "share": None if point is None else point / max(self.saved.config.history, 1),
+            "updates": self.snapshot.updates,
+            "training_seconds": round(self.snapshot.seconds, 1),
+            **report.results(self.provenance, self.columns()),
+            "settings": comparison.settings(self.saved.config),
+        }
+
+    def columns(self) -> dict[str, dict[str, np.ndarray]]:
+        """Its records by group, as named columns."""
+        return {name: report.columns(self.task.tables, *pair) for name, pair in self.played.items()}
+
+
+def find(run: Path, with_history: bool = False, data: str | None = None) -> list[Saved]:
+    """The newest network of a run, or its whole history, oldest first.
+
+    Args:
+      data: file of rooms to evaluate in, in place of the run's.
+
+    Raises:
+      ValueError: the folder holds no run, or none of its networks.
+    """
+    config = configs.load(run / CONFIG_FILE)
+    if with_history:
+        points: list[Path | None] = [*history.points(run)]
+        if not points:
+            raise ValueError(f"{run / history.FOLDER}: no history; train with --history above 0")
+        return [Saved(run, config, point, data) for point in points]
+    if not is_passed_on(run) and Checkpoints(run).latest() is None:
+        raise ValueError(f"{run}: no checkpoint")
+    return [Saved(run, config, None, data)]
+
+
+def share(run: Path, out: Path) -> None:
+    """Makes a small folder of a run's newest network: enough to load, evaluate and look at.
+
+    It holds the configuration, the classes, the network with 16 bits a parameter, and the run's
+    results and records if there are any; nothing to go on training with.
+
+    Raises:
+      ValueError: the folder holds no run, or its network cannot be read or does not fit.
+    """
+    network = find(run)[0]
+    out.mkdir(parents=True, exist_ok=True)
+    history.save(out / history.NETWORK, network.load(), half=True)
+    configs.save(network.config, out / CONFIG_FILE)
+    classes.load(run).save(out)
+    for name in (report.RESULTS_PAGE, report.EPISODES_FILE, report.RESULTS_FILE):
+        if (run / name).is_file():
+            shutil.copyfile(run / name, out / name)
+
+
+def evaluate(
+    networks: Sequence[Saved], greedy: bool, seed: int | None = None
+) -> Iterator[Evaluated]:
+    """Plays the fixed test episodes with every network; those of one task come together.
+
+    Args:
+      seed: of sampled actions; None takes each run's own, as its training does at its end.
+
+    Raises:
+      ValueError: a network cannot be read, or was trained on other scene tables.
+    """
+    groups: dict[TrainConfig, list[Saved]] = {}
+    for network in networks:
+        groups.setdefault(_task_config(network), []).append(network)
+    for config, members in groups.items():
+        task = load_task(config)
+        lists = episodes.load(task.tables, task.split, task.extras)
+        policy = policies.network(task.model, task.words, greedy)
+        for start in range(0, len(members), TOGETHER):
+            part = members[start : start + TOGETHER]
+            snapshots = [_checked(network, task) for network in part]
+            weights = jax.tree.map(
+                lambda *leaves: jnp.stack(leaves), *(s.weights for s in snapshots)
+            )
+            seeds = [network.config.seed if seed is None else seed for network in part]
+            # Side by side, networks that adapt would do so in every step.
+            batched = False if isinstance(task.model, AdaptiveActorCritic) else None
+            played = rollout.evaluate_stacked(
+                policy, weights, task.eval_params, lists, seeds, batched
+            )
+            for network, snapshot, own, drawn in zip(part, snapshots, played, seeds, strict=True):
+                yield Evaluated(
+                    saved=network,
+                    snapshot=dataclasses.replace(snapshot, weights=None),
+                    task=task,
+                    provenance=_provenance(network, snapshot, task, greedy, drawn),
+                    played=own,
+                )
+
+
+def _task_config(network: Saved) -> TrainConfig:
+    """Its configuration in the rooms to evaluate in, all that only training uses at its default."""
+    default = TrainConfig()
+    names = (
+        "steps", "episodes", "minutes", "seed", "chunk_updates", "checkpoint_minutes", "history",
+        "max_skipped", "learner",
+    )  # fmt: skip
+    unused = {name: getattr(default, name) for name in names}
+    return dataclasses.replace(network.config, data=network.rooms, **unused)
+
+
+def _checked(network: Saved, task: Task) -> Snapshot:
+    snapshot = network.load()
+    if network.data is None and snapshot.data_version != task.tables.data_version:
+        raise ValueError(
+            f"{network.point or network.run}: trained on scene tables {snapshot.data_version}, "
+            f"these are {task.tables.data_version}"
+        )
+    task.check_known(network.run, classes.load(network.run).names)
+    return snapshot
+
+
+def _provenance(
+    network: Saved, snapshot: Snapshot, task: Task, greedy: bool, seed: int
+) -> report.Provenance:
+    return report.Provenance(
+        split=task.split.name,
+        model=network.config.model,
+        policy="greedy" if greedy else "sample",
+        episodes_trained=snapshot.episodes,
+        seed=network.config.seed,
+        evaluation_seed=seed,
+        steps=snapshot.updates * network.config.steps_per_update,
+        data_version=task.tables.data_version,
+        data=network.rooms,
+        image=task.image,
+        odometry=task.model.odometry,
+        triangulation=task.model.triangulation,
+    )

@@ -1,0 +1,212 @@
+"""A sweep: runs of several splits, models and seeds in one folder.
+
+A run's folder tells how far it is: nothing yet, begun (there is a `config.json`), or finished
+(there is a `results.json`, which is written last). So an interrupted sweep goes on where it was.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+from tdanet_jax import config as configs
+from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.evaluation import comparison
+from tdanet_jax.evaluation.comparison import Result
+from tdanet_jax.io import files
+from tdanet_jax.vocabulary import split_name
+
+#: Where the evaluated histories of a sweep's runs are kept.
+HISTORIES = "histories"
+
+
+def plan(
+    base: TrainConfig, splits: Sequence[str], models: Sequence[str], seeds: Sequence[int]
+) -> list[TrainConfig]:
+    """The configurations of a sweep, seeds of one split and model together.
+
+    Raises:
+      ValueError: a value is not allowed or given twice; the message names the flag.
+    """
+    splits = [split_name(split) for split in splits]
+    for flag, given in (("--splits", splits), ("--models", models), ("--seeds", seeds)):
+        if not given:
+            raise ValueError(f"{flag}: give at least one")
+        if len(set(given)) < len(given):
+            raise ValueError(f"{flag}: a value is given twice")
+    out = [
+        dataclasses.replace(base, split=split, model=model, seed=seed)
+        for split in splits
+        for model in models
+        for seed in seeds
+    ]
+    for config in out:
+        config.check()
+    return out
+
+
+def progress(folder: Path, config: TrainConfig) -> Literal["new", "begun", "finished"]:
+    """How far the run of a configuration is.
+
+    Args:
+      config: as it runs, with no `auto` left (`task.resolve`).
+
+    Raises:
+      ValueError: the folder holds a run of another configuration; the message names the flags.
+    """
+    from tdanet_jax.evaluation.report import RESULTS_FILE
+
+    if not (folder / CONFIG_FILE).exists():
+        return "new"
+    there = comparison.flags(configs.load(folder / CONFIG_FILE))
+    ours = comparison.flags(config)
+    differing = sorted(flag for flag in ours if ours[flag] != there[flag])
+    if differing:
+        raise ValueError(
+            f"{folder}: trained with other values of {', '.join(differing)}; "
+            "choose another --out, or the flags of before"
+        )
+    return "finished" if (folder / RESULTS_FILE).exists() else "begun"
+
+
+@dataclasses.dataclass(frozen=True)
+class Finished:
+    """A finished run.
+
+    Attributes:
+      folder: where it is.
+      config: what was trained.
+      results: the content of its `results.json`, and its settings.
+      seconds: training time; None if nothing says.
+    """
+
+    folder: Path
+    config: TrainConfig
+    results: Result
+    seconds: float | None
+
+
+def finished(folder: Path) -> Finished:
+    """A finished run.
+
+    Raises:
+      ValueError: the folder holds none; the message names it.
+    """
+    from tdanet_jax.evaluation.report import RESULTS_FILE
+    from tdanet_jax.training.run import METRICS_FILE, read_metrics
+
+    config = configs.load(folder / CONFIG_FILE)
+    path = folder / RESULTS_FILE
+    try:
+        results = json.loads(path.read_text())
+        results["seen"]["L>=1"], *(results[name] for name in _READ)
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; the run is not finished") from None
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not the results of a run ({error})") from None
+    rows = read_metrics(folder) if (folder / METRICS_FILE).exists() else []
+    results["settings"] = comparison.settings(config)
+    return Finished(folder, config, results, rows[-1]["seconds"] if rows else None)
+
+
+#: What a report reads in a `results.json`, beside the rates of groups.
+_READ = (
+    "split", "model", "policy", "seed", "data_version", "episodes_trained", "steps", "by_room"
+)  # fmt: skip
+
+
+def find(out: Path) -> list[Finished]:
+    """The finished runs in a sweep's folder, by name."""
+    return [finished(path) for path in _with_results(out) if (path / CONFIG_FILE).exists()]
+
+
+def find_others(out: Path) -> list[Path]:
+    """Folders of results there that are no runs, say of a policy without training."""
+    return [path for path in _with_results(out) if not (path / CONFIG_FILE).exists()]
+
+
+def _with_results(out: Path) -> list[Path]:
+    from tdanet_jax.evaluation.report import RESULTS_FILE
+
+    return [path.parent for path in sorted(out.glob(f"*/{RESULTS_FILE}"))]
+
+
+def labels(runs: Sequence[Finished]) -> list[str]:
+    """What the report calls each run: those that differ in the seed alone share a name."""
+    return comparison.labels([run.results for run in runs], [run.folder.name for run in runs])
+
+
+def histories(runs: Sequence[Finished], out: Path) -> Iterator[tuple[Finished, int]]:
+    """Evaluates the histories that are not evaluated yet, into `out`/histories/<run>.json.
+
+    Actions are sampled with each run's own seed: the end of its budget gives its results again.
+    Yields a run and the points of it that are done, after each point.
+
+    Raises:
+      ValueError: a point cannot be read, or belongs to other rooms.
+    """
+    from tdanet_jax.evaluation import saved_networks
+    from tdanet_jax.training import history
+
+    waiting = {}
+    for run in runs:
+        if history.points(run.folder) and evaluated_history(run, out) is None:
+            waiting[run.folder] = (run, saved_networks.find(run.folder, with_history=True))
+    done: dict[Path, list[Result]] = {folder: [] for folder in waiting}
+    networks = [network for _, members in waiting.values() for network in members]
+    for one in saved_networks.evaluate(networks, greedy=False):
+        folder = one.saved.run
+        run, members = waiting[folder]
+        done[folder].append(one.results())
+        if len(done[folder]) == len(members):
+            (out / HISTORIES).mkdir(exist_ok=True)
+            kept = {"of": _fingerprint(run), "results": done[folder]}
+            files.write_text(out / HISTORIES / f"{folder.name}.json", json.dumps(kept) + "\n")
+        yield run, len(done[folder])
+
+
+def evaluated_history(run: Finished, out: Path) -> list[Result] | None:
+    """The results of a run's history, or None if it is not evaluated as it is now."""
+    path = out / HISTORIES / f"{run.folder.name}.json"
+    if not path.exists():
+        return None
+    try:
+        kept = json.loads(path.read_text())
+        of, results = kept["of"], kept["results"]
+    except (ValueError, KeyError, TypeError):
+        return None  # it is evaluated anew
+    return results if of == _fingerprint(run) else None
+
+
+def _fingerprint(run: Finished) -> str:
+    """Another one for another configuration, other rooms or other networks in its history."""
+    from tdanet_jax.training import history
+
+    points = {path.name: history.checksums(path) for path in history.points(run.folder)}
+    told = [configs.to_json(run.config), run.results["data_version"], points]
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+
+
+def untrained(runs: Sequence[Finished], seed: int) -> list[Result]:
+    """Results of random actions and of the shortest path on the splits of the runs."""
+    from tdanet_jax.evaluation import episodes, policies, report, rollout
+    from tdanet_jax.task import load_task
+
+    out: list[Result] = []
+    for config in {run.results["split"]: run.config for run in runs}.values():
+        task = load_task(config)
+        lists = episodes.load(task.tables, task.split, task.extras)
+        for name, make in (("random", policies.random), ("shortest_path", policies.shortest_path)):
+            played = rollout.evaluate_lists(make(), None, task.eval_params, lists, seed)
+            provenance = report.Provenance(
+                split=task.split.name, model=name, policy=name, episodes_trained=0, seed=seed,
+                evaluation_seed=seed, steps=0, data_version=task.tables.data_version,
+                data=config.data,
+            )  # fmt: skip
+            groups = {group: report.columns(task.tables, *pair) for group, pair in played.items()}
+            out.append(report.results(provenance, groups))
+    return out

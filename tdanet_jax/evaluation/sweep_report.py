@@ -1,0 +1,288 @@
+"""The report on the runs of a sweep: the paper's tables, costs and learning curves."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tdanet_jax.config import MODELS
+from tdanet_jax.evaluation import comparison, paper
+from tdanet_jax.evaluation.comparison import Curve, Result, Spread
+from tdanet_jax.evaluation.sweep import Finished, evaluated_history, labels
+from tdanet_jax.vocabulary import UNSEEN
+
+REPORT_VERSION = 1
+#: The splits of the paper's tables.
+PAPER_SPLITS = ("18/4", "14/8")
+
+
+@dataclasses.dataclass(frozen=True)
+class Cost:
+    """Size and speed of a model on this machine.
+
+    Attributes:
+      model: its name.
+      parameters: all trained numbers; word vectors are not among them.
+      milliseconds: of one decision for a batch of so many agents.
+    """
+
+    model: str
+    parameters: int
+    milliseconds: Mapping[int, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """All that the report shows.
+
+    Attributes:
+      runs: the finished runs.
+      untrained: results of policies that need no training, one for each split and policy.
+      costs: by the runs' labels.
+      curves: learning curves by split.
+      machine: where the costs were measured.
+      code: the version of the code.
+    """
+
+    runs: Sequence[Finished]
+    untrained: Sequence[Result]
+    costs: Mapping[str, Cost]
+    curves: Mapping[str, Sequence[Curve]]
+    machine: str
+    code: str
+
+    @property
+    def splits(self) -> list[str]:
+        """The splits that were trained, in the order of the vocabulary."""
+        names = {run.results["split"] for run in self.runs}
+        return [name for name in UNSEEN if name in names] + sorted(names - set(UNSEEN))
+
+    def results(self, split: str) -> dict[str, list[Result]]:
+        """Results on a split by label: those without training, then in the order of MODELS."""
+        named = [(result["model"], result) for result in self.untrained]
+        named += zip(labels(self.runs), (run.results for run in self.runs), strict=True)
+        found: dict[str, list[Result]] = {}
+        for label, result in sorted(named, key=lambda pair: _place(pair[1]["model"])):
+            if result["split"] == split:
+                found.setdefault(label, []).append(result)
+        return found
+
+
+def _place(model: str) -> tuple[int, str]:
+    """Sorts models: those without training, then in the order of MODELS, then by name."""
+    order = ["random", "shortest_path", *MODELS]
+    return (order.index(model) if model in order else len(order), model)
+
+
+def make_curves(runs: Sequence[Finished], out: Path) -> dict[str, list[Curve]]:
+    """Learning curves by split, one a label, from the evaluated histories."""
+    found: dict[str, dict[str, list[list[Result]]]] = {}
+    named = zip(labels(runs), runs, strict=True)
+    for label, run in sorted(named, key=lambda pair: _place(pair[1].config.model)):
+        results = evaluated_history(run, out)
+        if results:
+            found.setdefault(run.results["split"], {}).setdefault(label, []).append(results)
+    return {
+        split: [comparison.curve(label, seeds) for label, seeds in by_label.items()]
+        for split, by_label in found.items()
+    }
+
+
+def to_json(report: Report) -> dict[str, Any]:
+    """The content of `report.json`."""
+    return {
+        "version": REPORT_VERSION,
+        "code": report.code,
+        "machine": report.machine,
+        "comparison": {
+            split: {
+                label: _plain(comparison.summary(results))
+                for label, results in report.results(split).items()
+            }
+            for split in report.splits
+        },
+        "paper": [rate._asdict() for rate in paper.RATES],
+        "paper_parameters_mebi": paper.PARAMETERS,
+        "costs": {label: dataclasses.asdict(cost) for label, cost in report.costs.items()},
+        "learning_curves": {
+            split: {
+                curve.label: {
+                    "episodes": curve.episodes,
+                    **{" ".join(key): _plain(values) for key, values in curve.values.items()},
+                }
+                for curve in curves
+            }
+            for split, curves in report.curves.items()
+        },
+        "runs": [
+            {
+                "run": str(run.folder),
+                "training_seconds": run.seconds,
+                **{k: v for k, v in run.results.items() if k not in ("by_room", "by_target")},
+            }
+            for run in report.runs
+        ],
+        "left_out": left_out(report),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Spreads as {"mean", "sd"}, in dictionaries and lists."""
+    if isinstance(value, Spread):
+        return {
+            "mean": round(value.mean, 3),
+            "sd": None if value.sd is None else round(value.sd, 3),
+        }
+    if isinstance(value, Mapping):
+        return {key: _plain(inner) for key, inner in value.items()}
+    return [_plain(inner) for inner in value] if isinstance(value, list) else value
+
+
+def left_out(report: Report) -> list[str]:
+    """One line for each part of the paper's tables that nothing was trained for."""
+    lines = []
+    for split in PAPER_SPLITS:
+        trained = {run.config.model for run in report.runs if run.results["split"] == split}
+        absent = [model for model in MODELS if model not in trained]
+        if len(absent) == len(MODELS):
+            lines.append(f"Split {split}: nothing was trained.")
+        elif absent:
+            lines.append(f"Split {split}: not trained: {', '.join(absent)}.")
+    drawn = {(split, curve.label) for split, curves in report.curves.items() for curve in curves}
+    flat = [
+        run.folder.name
+        for label, run in zip(labels(report.runs), report.runs, strict=True)
+        if (run.results["split"], label) not in drawn
+    ]
+    if flat:
+        lines.append(f"Learning curve: no history of {', '.join(flat)}.")
+    return lines
+
+
+def markdown(report: Report, figures: Mapping[str, str]) -> str:
+    """`report.md`.
+
+    Args:
+      figures: name of the learning curve's file by split.
+    """
+    lines = [
+        f"# {len(report.runs)} runs",
+        "",
+        f"SR and SPL in percent, test rooms, sampled actions; mean ± deviation over seeds of one "
+        f"configuration. Code {report.code}.",
+    ]
+    for split in report.splits:
+        lines += _comparison(report, split)
+        if split in figures:
+            lines += ["", f"![Learning curve, split {split}]({figures[split]})"]
+        lines += _by_room(report, split)
+    lines += _ablations(report)
+    lines += _costs(report)
+    lines += _runs(report)
+    if absent := left_out(report):
+        lines += ["", "## Left out", "", *(f"- {line}" for line in absent)]
+    return "\n".join(lines) + "\n"
+
+
+def _comparison(report: Report, split: str) -> Iterator[str]:
+    """The paper's comparison of models on one split, as a whole and by room type."""
+    results = report.results(split)
+    summaries = {label: comparison.summary(members) for label, members in results.items()}
+    rows = [
+        ((f"{label} (ours)", str(len(out["seeds"])), _count(out["episodes_trained"])), out)
+        for label, out in summaries.items()
+    ]
+    theirs = comparison.paper_rows(split)
+    rows += [((f"{agent} (paper)", "", ""), groups) for agent, groups in theirs.items()]
+    tables = " (the paper's Tables I to III)" if split in PAPER_SPLITS else ""
+    yield from ("", f"## Split {split}: comparison of models{tables}", "")
+    yield from comparison.table(("Model", "Seeds", "Training episodes"), rows)
+    if theirs:
+        worlds = dict.fromkeys(
+            paper.worlds(run.config.data) for run in report.runs if run.results["split"] == split
+        )
+        yield from ("", *worlds)
+
+
+def _by_room(report: Report, split: str) -> Iterator[str]:
+    """The same by room type; the shortest path scores 100 everywhere and is left out."""
+    results = report.results(split)
+    summaries = {k: comparison.summary(r) for k, r in results.items() if k != "shortest_path"}
+    rooms = dict.fromkeys(room for out in summaries.values() for room in out["by_room"])
+    rows = [
+        ((room, label), out["by_room"][room])
+        for room in rooms
+        for label, out in summaries.items()
+        if room in out["by_room"]
+    ]
+    yield from ("", f"### Split {split}, by room type", "")
+    yield from comparison.table(("Room", "Model"), rows)
+
+
+def _ablations(report: Report) -> Iterator[str]:
+    """TDANet and its parts left out, where any such model was trained."""
+    module = MODELS["tdanet"][0]
+    variants = [model for model, (name, _) in MODELS.items() if name == module]
+    rows = []
+    for split in report.splits:
+        results = report.results(split)
+        models = {label: members[0]["model"] for label, members in results.items()}
+        if len(set(models.values()) & set(variants)) > 1:
+            for label in (label for label, model in models.items() if model in variants):
+                made_with = MODELS[models[label]][1]
+                parts = ["no" if made_with.get(p) is False else "yes" for p in _ABLATED]
+                rows.append(((split, label, *parts), comparison.summary(results[label])))
+    if rows:
+        yield from ("", "## Ablations (the paper's Tables IV and V)", "")
+        yield from comparison.table(("Split", "Model", *_ABLATED.values()), rows)
+
+
+_ABLATED = {"target_attention": "Target attention", "siamese": "Siamese comparison"}
+
+
+def _costs(report: Report) -> Iterator[str]:
+    """Parameters and inference time."""
+    batches = list(dict.fromkeys(b for cost in report.costs.values() for b in cost.milliseconds))
+    heads = [
+        "Model",
+        "Parameters",
+        "in 2^20",
+        "in 2^20, paper",
+        *(f"ms, batch {b:,}" for b in batches),
+    ]
+    yield from ("", "## Parameters and inference time", "")
+    yield from (f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}")
+    for label, cost in sorted(report.costs.items(), key=lambda item: _place(item[1].model)):
+        published = paper.PARAMETERS.get(paper.NAMES.get(cost.model, ""))
+        cells = [
+            label,
+            f"{cost.parameters:,}",
+            f"{cost.parameters / 2**20:.2f}",
+            "-" if published is None else f"{published:.2f}",
+            *(f"{cost.milliseconds[batch]:.2f}" for batch in batches),
+        ]
+        yield f"| {' | '.join(cells)} |"
+    yield from ("", f"One decision of so many agents at once, on {report.machine}.")
+    yield "The paper's word vectors are 300 wide; the input layers here follow the run's."
+
+
+def _runs(report: Report) -> Iterator[str]:
+    """Every run."""
+    yield from ("", "## Runs", "")
+    rows = [
+        (
+            (run.folder.name, str(run.results["seed"]), f"{run.results['episodes_trained']:,}",
+             f"{run.results['steps']:,}",
+             "-" if run.seconds is None else f"{run.seconds / 60:.1f}"),
+            run.results,
+        )
+        for run in report.runs
+    ]  # fmt: skip
+    heads = ("Run", "Seed", "Training episodes", "Steps", "Training minutes")
+    yield from comparison.table(heads, rows)
+
+
+def _count(value: Spread | None) -> str:
+    return "" if value is None else f"{value.mean:,.0f}"

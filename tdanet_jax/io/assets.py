@@ -1,0 +1,58 @@
+"""Where the bundled data files live, and whether they are the files that were built."""
+
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+
+CHECKSUMS = "checksums.json"
+
+
+class AssetError(ValueError):
+    """A bundled file is missing or is not the one whose checksum was recorded."""
+
+
+def folder() -> Path:
+    """The folder of bundled files: inside an installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    for candidate in (package / "assets", package.parent / "assets"):
+        if (candidate / CHECKSUMS).is_file():
+            return candidate
+    raise AssetError(
+        f"{package.parent / 'assets' / CHECKSUMS}: missing; "
+        "reinstall tdanet_jax or run `python -m experiments.scenes build`"
+    )
+
+
+def sha256(path: Path) -> str:
+    """Hex digest of a file's content."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@cache
+def path(name: str) -> Path:
+    """Path of the bundled file `name`, its content verified (once per process).
+
+    Raises:
+        AssetError: the file is missing, unlisted or corrupt.
+    """
+    root = folder()
+    file = root / name
+    if not file.is_file():
+        raise AssetError(f"{file}: missing; reinstall tdanet_jax")
+    try:
+        expected = json.loads((root / CHECKSUMS).read_text()).get(name)
+    except (json.JSONDecodeError, AttributeError):
+        raise AssetError(f"{root / CHECKSUMS}: not a JSON object; reinstall tdanet_jax") from None
+    if expected is None:
+        raise AssetError(f"{root / CHECKSUMS}: no checksum for {name}; reinstall tdanet_jax")
+    if sha256(file) != expected:
+        raise AssetError(f"{file}: corrupt (sha256 differs from {CHECKSUMS}); reinstall tdanet_jax")
+    return file
+
+
+def record(root: Path, names: list[str]) -> None:
+    """Write the checksums of `names` in `root`, sorted, so that rebuilding gives equal bytes."""
+    sums = {name: sha256(root / name) for name in sorted(names)}
+    (root / CHECKSUMS).write_text(json.dumps(sums, indent=2) + "\n")

@@ -1,0 +1,116 @@
+"""HDF5 from outside: hard-linked, plainly stored, small datasets of numbers, and nothing else."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tdanet_jax.io.untrusted.errors import FileError
+
+#: Numbers in the largest dataset that is read; a feature map has 512 x 7 x 7.
+LARGEST = 1 << 22
+#: HDF5's codes of the filters that come with it: deflate, shuffle, checksum; and h5py's lzf.
+_FILTERS = (1, 2, 3, 32000)
+
+
+class Reader:
+    """The datasets of an open file, by name."""
+
+    def __init__(self, path: Path, file: Any) -> None:
+        self._path = path
+        self._file = file
+
+    def names(self) -> list[str]:
+        """Names at the top of the file."""
+        with _plain_errors(self._path):
+            return [str(name) for name in self._file]
+
+    def __contains__(self, name: str) -> bool:
+        with _plain_errors(self._path):
+            return name in self._file
+
+    def read(self, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
+        """The numbers of a dataset.
+
+        Args:
+            shape: what its shape must be, if that is known.
+
+        Raises:
+            FileError: it is a link to elsewhere, is stored elsewhere, too large, not numbers, not
+                finite, or of another shape.
+        """
+        import h5py
+
+        with _plain_errors(self._path):
+            link = self._file.get(name, getlink=True)
+            if not isinstance(link, h5py.HardLink):
+                raise FileError(self._path, f"{name} is a link to elsewhere")
+            dataset = self._file[name]
+            if not isinstance(dataset, h5py.Dataset):
+                raise FileError(self._path, f"{name} is not a dataset")
+            self._check(name, dataset, shape)
+            value = np.asarray(dataset[()])
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            raise FileError(self._path, f"{name} holds NaN or infinity")
+        return value
+
+    def _check(self, name: str, dataset: Any, shape: tuple[int, ...] | None) -> None:
+        """Refuses what may not be read, before any of it is."""
+        if dataset.external or dataset.is_virtual:
+            raise FileError(self._path, f"{name} is stored in another file")
+        if dataset.shape is None or dataset.dtype.kind not in "fiu":
+            raise FileError(self._path, f"{name} holds no numbers")
+        if shape is not None and dataset.shape != shape:
+            raise FileError(self._path, f"{name} has shape {dataset.shape}, not {shape}")
+        largest = max(_count(dataset.shape), _count(dataset.chunks or ()))
+        if largest > LARGEST:
+            raise FileError(self._path, f"{name} has {largest} numbers, more than {LARGEST}")
+        stored = dataset.id.get_create_plist()
+        if any(stored.get_filter(i)[0] not in _FILTERS for i in range(stored.get_nfilters())):
+            raise FileError(self._path, f"{name} is compressed in a way that is not read here")
+
+
+def _count(shape: tuple[int, ...]) -> int:
+    total = 1
+    for size in shape:
+        total *= int(size)
+    return total
+
+
+def need_h5py(path: Path) -> None:
+    """Raises FileError, before a file is read or written, if h5py is not installed."""
+    try:
+        import h5py  # noqa: F401
+    except ImportError:
+        raise FileError(path, "needs h5py: pip install h5py") from None
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Reader]:
+    """Opens a file to read from it.
+
+    Raises:
+        FileError: it is missing or no HDF5 file, or h5py is not installed.
+    """
+    need_h5py(path)
+    import h5py
+
+    if not path.is_file():
+        raise FileError(path, "no such file")
+    with _plain_errors(path):
+        file = h5py.File(path, "r", locking=False)
+    with file:
+        yield Reader(path, file)
+
+
+@contextlib.contextmanager
+def _plain_errors(path: Path) -> Iterator[None]:
+    """Whatever h5py raises about a broken file becomes one line."""
+    try:
+        yield
+    except FileError:
+        raise
+    except Exception as error:  # h5py raises many kinds for a damaged file
+        raise FileError(path, f"not a readable HDF5 file ({error})") from None

@@ -1,0 +1,365 @@
+"""Plain values out of pickles from outside. Nothing is imported and nothing is called.
+
+A small machine runs the opcodes, decoded by the standard library's `pickletools`, and notes
+down what the pickle would have built: a `Call` with a name and arguments. Functions here then read
+the few shapes that are known: arrays and tensors. A name that is not on the list ends the reading.
+
+torch.save's two formats are read as well: several pickles and the tensors' bytes one after the
+other, and a zip file. A tensor inside a plain pickle carries the former as bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickletools
+import warnings
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from tdanet_jax.io.untrusted.errors import FileError
+
+#: Numbers in the largest array, and bytes of the largest file that is read.
+LARGEST, LARGEST_FILE = 1 << 24, 1 << 30
+AGENT_STATE = "ThorAgentState"  # of any module: the reference's forks moved it about
+_STORAGES = {
+    "FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2", "LongStorage": "<i8",
+    "IntStorage": "<i4", "ShortStorage": "<i2", "ByteStorage": "u1", "CharStorage": "i1",
+}  # fmt: skip
+_ARRAY = tuple(f"numpy.{core}.multiarray._reconstruct" for core in ("core", "_core"))
+_TENSOR = ("torch._utils._rebuild_tensor_v2", "torch._utils._rebuild_tensor")
+_BYTES, _NESTED, _DTYPE = "_codecs.encode", "torch.storage._load_from_bytes", "numpy.dtype"
+_ALLOWED = {
+    *_ARRAY, *_TENSOR, _BYTES, _NESTED, _DTYPE, "numpy.ndarray", "collections.OrderedDict",
+    *(f"{module}.{name}" for name in _STORAGES for module in ("torch", "torch.cuda")),
+}  # fmt: skip
+_MAGIC, _PROTOCOL = 0x1950A86A20F9469CFC6C, 1001
+
+
+@dataclass
+class Name:
+    """A class or function that a pickle names; never looked up."""
+
+    name: str
+
+
+@dataclass
+class Call:
+    """What a pickle would have called, and the state that it would have set afterwards."""
+
+    name: str
+    arguments: tuple
+    state: Any = None
+
+
+@dataclass
+class Storage:
+    """The numbers behind a tensor; they follow later in the file."""
+
+    dtype: str
+    key: str
+    count: int
+    values: np.ndarray | None = None
+
+
+@dataclass
+class _Mark:
+    pass
+
+
+@dataclass
+class _Machine:
+    """One pickle's stack and memo."""
+
+    path: str
+    stack: list = field(default_factory=list)
+    memo: dict[int, Any] = field(default_factory=dict)
+    storages: list[Storage] = field(default_factory=list)
+
+    def run(self, stream: io.BytesIO) -> Any:
+        """The value of the pickle at the stream's position, which moves behind it."""
+        for opcode, argument, _ in pickletools.genops(stream):
+            if opcode.name == "STOP":
+                return self.stack.pop()
+            if opcode.name in _PUSHED:
+                self.stack.append(argument)
+            elif opcode.name in _FRESH:
+                self.stack.append(_FRESH[opcode.name]())
+            elif opcode.name in _STEPS:
+                _STEPS[opcode.name](self, argument)
+            elif opcode.name not in ("PROTO", "FRAME"):
+                raise FileError(self.path, f"a pickle with {opcode.name}, which is not read here")
+        raise FileError(self.path, "a pickle without an end")
+
+    def above_mark(self) -> list:
+        """Takes everything above the last mark, and the mark, off the stack."""
+        items = []
+        while not isinstance(item := self.stack.pop(), _Mark):
+            items.append(item)
+        return items[::-1]
+
+    def push_tuple(self, count: int) -> None:
+        items = [self.stack.pop() for _ in range(count)]
+        self.stack.append(tuple(items[::-1]))
+
+    def push_dict(self, items: list) -> None:
+        self.stack.append({})
+        self.set_items(items)
+
+    def drop(self) -> None:
+        self.stack.pop()
+
+    def push_name(self, name: str) -> None:
+        if name not in _ALLOWED and name.rpartition(".")[2] != AGENT_STATE:
+            raise FileError(self.path, f"a pickle names {name}, which such a file does not hold")
+        self.stack.append(Name(name))
+
+    def push_named(self) -> None:
+        name, module = self.stack.pop(), self.stack.pop()
+        self.push_name(f"{module}.{name}" if isinstance(module, str) else "?")
+
+    def call(self) -> None:
+        arguments, function = self.stack.pop(), self.stack.pop()
+        if not isinstance(function, Name) or not isinstance(arguments, tuple):
+            raise FileError(self.path, "a pickle calls what is no function")
+        self.stack.append(Call(function.name, arguments))
+
+    def build(self) -> None:
+        state = self.stack.pop()
+        if not isinstance(self.stack[-1], Call):
+            raise FileError(self.path, "a pickle sets the state of what has none")
+        self.stack[-1].state = state
+
+    def append(self, items: list) -> None:
+        self._top(list).extend(items)
+
+    def set_items(self, items: list) -> None:
+        top = self.stack[-1]
+        target = {} if isinstance(top, Call) else self._top(dict)  # an OrderedDict's are not needed
+        for key, value in zip(items[::2], items[1::2], strict=True):
+            if not isinstance(key, str | int | bytes):  # others may be too deep to be hashed
+                raise FileError(self.path, "a pickle with an odd dictionary")
+            target[key] = value
+
+    def _top(self, kind: type) -> Any:
+        if not isinstance(self.stack[-1], kind):
+            raise FileError(self.path, f"a pickle fills what is no {kind.__name__}")
+        return self.stack[-1]
+
+    def push_storage(self) -> None:
+        """A tensor's storage: ("storage", type, key, place, count, None)."""
+        identity = self.stack.pop()
+        match identity:
+            case ("storage", Name(name), str(key), str(), int(count), *rest) if rest in (
+                [],
+                [None],
+            ):
+                dtype = _STORAGES.get(name.rpartition(".")[2])
+            case _:
+                dtype = None
+        if dtype is None or not 0 <= count <= LARGEST:
+            raise FileError(self.path, "a pickle with a storage that is not read here")
+        known = [other for other in self.storages if other.key == key]
+        storage = known[0] if known else Storage(dtype, key, count)
+        if not known:
+            self.storages.append(storage)
+        self.stack.append(storage)
+
+
+_PUSHED = {
+    "INT", "LONG", "LONG1", "LONG4", "BININT", "BININT1", "BININT2", "FLOAT", "BINFLOAT", "STRING",
+    "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "UNICODE",
+    "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8",
+}  # fmt: skip
+_FRESH: dict[str, Callable[[], Any]] = {
+    "NONE": lambda: None, "NEWTRUE": lambda: True, "NEWFALSE": lambda: False, "MARK": _Mark,
+    "EMPTY_TUPLE": tuple, "EMPTY_LIST": list, "EMPTY_DICT": dict,
+}  # fmt: skip
+
+
+def _remember(machine: _Machine, argument: Any) -> None:
+    machine.memo[len(machine.memo) if argument is None else argument] = machine.stack[-1]
+
+
+def _recall(machine: _Machine, argument: Any) -> None:
+    machine.stack.append(machine.memo[argument])
+
+
+def _pair(machine: _Machine) -> list:
+    value, key = machine.stack.pop(), machine.stack.pop()
+    return [key, value]
+
+
+_STEPS: dict[str, Callable[[_Machine, Any], None]] = {
+    "POP": lambda m, _: m.drop(),
+    "PUT": _remember, "BINPUT": _remember, "LONG_BINPUT": _remember, "MEMOIZE": _remember,
+    "GET": _recall, "BINGET": _recall, "LONG_BINGET": _recall,
+    "TUPLE": lambda m, _: m.stack.append(tuple(m.above_mark())),
+    "TUPLE1": lambda m, _: m.push_tuple(1),
+    "TUPLE2": lambda m, _: m.push_tuple(2),
+    "TUPLE3": lambda m, _: m.push_tuple(3),
+    "LIST": lambda m, _: m.stack.append(m.above_mark()),
+    "DICT": lambda m, _: m.push_dict(m.above_mark()),
+    "APPEND": lambda m, _: m.append([m.stack.pop()]),
+    "APPENDS": lambda m, _: m.append(m.above_mark()),
+    "SETITEM": lambda m, _: m.set_items(_pair(m)),
+    "SETITEMS": lambda m, _: m.set_items(m.above_mark()),
+    "GLOBAL": lambda m, argument: m.push_name(argument.replace(" ", ".")),
+    "STACK_GLOBAL": lambda m, _: m.push_named(),
+    "REDUCE": lambda m, _: m.call(),
+    "NEWOBJ": lambda m, _: m.call(),
+    "BUILD": lambda m, _: m.build(),
+    "BINPERSID": lambda m, _: m.push_storage(),
+}  # fmt: skip
+
+
+def load(data: bytes, path: object) -> Any:
+    """The value of a pickle: plain values, `Call`s and `Name`s.
+
+    Args:
+        path: names the file in messages.
+
+    Raises:
+        FileError: it is no pickle, or holds something that is not on the list.
+    """
+    return _run(io.BytesIO(data), str(path))[0]
+
+
+def load_torch(data: bytes, path: object) -> Any:
+    """The value of a file that torch.save wrote, in either of its formats.
+
+    Raises:
+        FileError: it is no such file, or holds something that is not on the list.
+    """
+    if data[:2] == b"PK":
+        return _load_zip(data, str(path))
+    stream = io.BytesIO(data)
+    head = [_run(stream, str(path))[0] for _ in range(3)]
+    if head[:2] != [_MAGIC, _PROTOCOL]:
+        raise FileError(path, "not a file of torch.save")
+    value, storages = _run(stream, str(path))
+    keys, _ = _run(stream, str(path))
+    if not isinstance(keys, list) or sorted(s.key for s in storages) != _sorted_texts(keys):
+        raise FileError(path, "not a file of torch.save (its storages do not match)")
+    by_key = {storage.key: storage for storage in storages}
+    for key in keys:
+        size = int.from_bytes(stream.read(8), "little")
+        _fill(by_key[key], stream.read(by_key[key].count * np.dtype(by_key[key].dtype).itemsize))
+        if size != by_key[key].count:
+            raise FileError(path, "not a file of torch.save (a storage of another size)")
+    return value
+
+
+def _sorted_texts(values: list) -> list[str] | None:
+    return sorted(values) if all(isinstance(value, str) for value in values) else None
+
+
+def _fill(storage: Storage, data: bytes) -> None:
+    if len(data) == storage.count * np.dtype(storage.dtype).itemsize:
+        storage.values = np.frombuffer(data, storage.dtype)
+
+
+def _load_zip(data: bytes, path: str) -> Any:
+    """torch.save's zip format: <name>/data.pkl, and <name>/data/<key> for each storage."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+            pickled = [name for name in sizes if name.endswith("/data.pkl")]
+            if len(pickled) != 1 or sum(sizes.values()) > LARGEST_FILE:
+                raise FileError(path, "not a file of torch.save")
+            value, storages = _run(io.BytesIO(archive.read(pickled[0])), path)
+            for storage in storages:
+                _fill(storage, archive.read(f"{pickled[0][:-4]}/{storage.key}"))
+    except FileError:
+        raise
+    except Exception as error:  # zipfile raises many kinds for a damaged file
+        raise FileError(path, f"not a file of torch.save ({error})") from None
+    return value
+
+
+def _run(stream: io.BytesIO, path: str) -> tuple[Any, list[Storage]]:
+    machine = _Machine(path)
+    try:
+        with warnings.catch_warnings(action="ignore"):  # pickletools' own, about odd escapes
+            return machine.run(stream), machine.storages
+    except FileError:
+        raise
+    except Exception as error:  # pickletools and an empty stack raise many kinds
+        raise FileError(path, f"not a pickle ({error or type(error).__name__})") from None
+
+
+def array(value: Any, path: object) -> np.ndarray:
+    """The numbers of a pickled NumPy array or torch tensor.
+
+    Raises:
+        FileError: it is neither, or not of plain numbers, or too large.
+    """
+    try:
+        if isinstance(value, Call) and value.name in _ARRAY:
+            return _numpy_array(value)
+        if isinstance(value, Call) and value.name in _TENSOR:
+            return _tensor(value, path)
+    except FileError:
+        raise
+    except Exception as error:  # whatever does not fit the shapes
+        raise FileError(path, f"a broken array ({error or type(error).__name__})") from None
+    raise FileError(path, "something other than an array")
+
+
+def _numpy_array(value: Call) -> np.ndarray:
+    _, shape, dtype, by_column, data = value.state
+    code = dtype.arguments[0]
+    order = dtype.state[1]
+    if dtype.name != _DTYPE or code not in _NUMBERS or order not in ("<", ">", "|", "="):
+        raise ValueError("not numbers")
+    numbers = np.frombuffer(_octets(data), np.dtype(code).newbyteorder(order))
+    if len(numbers) > LARGEST:
+        raise ValueError("too large")
+    return numbers.reshape(_sizes(shape), order="F" if by_column else "C")
+
+
+_NUMBERS = {f"{kind}{size}" for kind, sizes in (("f", "248"), ("iu", "1248")) for kind in kind
+            for size in sizes}  # fmt: skip
+
+
+def _octets(data: Any) -> bytes:
+    """Bytes; pickles of protocol 2 write them as text in latin-1 and a call that encodes it."""
+    if isinstance(data, Call) and data.name == _BYTES and data.arguments[1:] == ("latin1",):
+        return data.arguments[0].encode("latin-1")
+    if not isinstance(data, bytes):
+        raise ValueError("no bytes")
+    return data
+
+
+def _tensor(value: Call, path: object) -> np.ndarray:
+    storage, first, shape, strides = value.arguments[:4]
+    if isinstance(storage, Call) and storage.name == _NESTED:
+        storage = load_torch(_octets(storage.arguments[0]), path)
+    elif isinstance(storage, Call) and storage.name.rpartition(".")[2] in _STORAGES:
+        kind = _STORAGES[storage.name.rpartition(".")[2]]
+        storage = Storage(kind, "", 0, np.array(storage.arguments[0], kind))
+    if not isinstance(storage, Storage) or storage.values is None:
+        raise ValueError("a tensor without numbers")
+    sizes, steps = _sizes(shape), _sizes(strides)
+    if len(sizes) != len(steps) or math.prod(sizes) > LARGEST:
+        raise ValueError("a tensor of an odd shape")
+    place = np.full(sizes, int(first), np.int64)
+    for axis, (size, step) in enumerate(zip(sizes, steps, strict=True)):
+        along = [1] * len(sizes)
+        along[axis] = size
+        place = place + (np.arange(size) * step).reshape(along)
+    if place.size and not 0 <= place.min() <= place.max() < len(storage.values):
+        raise ValueError("a tensor beyond its storage")
+    return storage.values[place]
+
+
+def _sizes(values: Any) -> tuple[int, ...]:
+    if not all(isinstance(v, int) and not isinstance(v, bool) for v in values):
+        raise ValueError("an odd shape")
+    if len(values) > 8 or not all(0 <= v <= LARGEST for v in values):
+        raise ValueError("an odd shape")
+    return tuple(values)

@@ -1,0 +1,1 @@
+"""How well the rooms agree with AI2-THOR."""

@@ -1,0 +1,1 @@
+"""From boxes to what is seen: solids, rays, rasters."""

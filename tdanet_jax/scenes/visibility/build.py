@@ -1,0 +1,192 @@
+"""What a camera sees from each reachable point, as boxes in the image.
+
+Object surfaces are divided into patches. A patch is seen if nothing hides its centre from the
+camera and the centre projects into the image. An object's box in the image is the extent of its
+seen patches, clipped to the image. Projections are element-wise float32 operations that
+IEEE 754 defines to the last bit, so that tables are equal on every machine.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tdanet_jax import poses
+from tdanet_jax.poses import HORIZONS
+from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene, SceneObject
+from tdanet_jax.scenes.visibility import rays
+from tdanet_jax.scenes.visibility.geometry import box_frame
+from tdanet_jax.scenes.visibility.rules import Rules
+from tdanet_jax.scenes.visibility.solids import THIN, Patches, millimetres, patches_of, solids_of
+
+IMAGE = 300  # pixels, width and height of the frame
+SUBPIXEL = 16  # boxes are stored in sixteenths of a pixel
+
+
+# Cosine and sine of each horizon; square roots are exact to the last bit everywhere.
+TILTS = ((np.float32(1), np.float32(0)), (np.sqrt(np.float32(0.75)), np.float32(0.5)))
+
+
+def turned(x: np.ndarray, z: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Coordinates to the right of and ahead of a level camera, for each of the eight headings."""
+    half = np.sqrt(np.float32(0.5))
+    plus, minus = (x + z) * half, (x - z) * half
+    return [
+        (x, z),
+        (minus, plus),
+        (-z, x),
+        (-plus, minus),
+        (-x, -z),
+        (-minus, -plus),
+        (z, -x),
+        (plus, -minus),
+    ]
+
+
+def tilted(up: np.ndarray, ahead: np.ndarray, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates up from and ahead of the camera after looking down to `horizon`."""
+    cosine, sine = TILTS[horizon]
+    return (
+        (up, ahead)
+        if horizon == 0
+        else (
+            cosine * up + sine * ahead,
+            cosine * ahead - sine * up,
+        )
+    )
+
+
+def project(across: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Distance from the image's middle, in sixteenths of a pixel, unclipped.
+
+    Points behind the camera land far outside the image, on their side of it.
+    """
+    return across * (np.float32(IMAGE * SUBPIXEL / 2) / np.maximum(depth, np.float32(1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What is seen from the cameras of one room: one row per state and object, sorted so."""
+
+    state: np.ndarray  # [N] int32
+    owner: np.ndarray  # [N] int32, index into the room's objects
+    box: np.ndarray  # [N, 4] int16, x1, y1, x2, y2 in sixteenths of a pixel
+    visible: np.ndarray  # [N] bool, within reach and more than a sliver
+
+
+def nearness(scene: Scene, points: np.ndarray, patches: Patches, rules: Rules) -> np.ndarray:
+    """Whether each object is within `rules.reach` of each of `points`, horizontally: [P, O].
+
+    Measured to the tightest known box where that is upright, else to the axis-aligned one; to
+    the patches that are left of a carved object.
+    """
+    result = np.empty((len(points), len(scene.objects)), bool)
+    for k, item in enumerate(scene.objects):
+        if item.object_class in rules.carved:
+            offset = points[:, None] - patches.center[patches.owner == k] / 1000
+            gap = (offset[..., 0] ** 2 + offset[..., 2] ** 2).min(axis=1, initial=np.inf)
+        else:
+            gap = _gap_to_box(item, points)
+        result[:, k] = gap <= rules.reach**2
+    return result
+
+
+def _gap_to_box(item: SceneObject, points: np.ndarray) -> np.ndarray:
+    """Squared horizontal distance of `points` [P, 3] from an object's box: [P], 0 inside."""
+    origin, edges = box_frame(item.box, item.corners)
+    flat = edges[np.abs(edges[:, 1]) < THIN][:, [0, 2]]
+    if len(flat) != 2 or np.abs(flat).max(axis=1).min() < THIN:
+        origin, flat = item.box[0], np.diag((item.box[1] - item.box[0])[[0, 2]])
+    gap = np.zeros(len(points))
+    for edge in flat:
+        length = max(np.sqrt((edge * edge).sum()), THIN)
+        along = (points[:, 0] - origin[0]) * edge[0] + (points[:, 2] - origin[2]) * edge[1]
+        beyond = np.maximum(np.maximum(-along / length, along / length - length), 0)
+        gap += beyond * beyond
+    return gap
+
+
+def look_around(scene: Scene, rules: Rules, points: np.ndarray | None = None) -> Sight:
+    """Everything seen from `points` [P, 3] (default: all reachable ones) in all 16 views."""
+    points = scene.points if points is None else points
+    patches = patches_of(scene, rules)
+    cameras = millimetres(points + np.array([0, CAMERA_ABOVE_AGENT, 0]))
+    before = np.zeros((len(points), len(patches.owner)))
+    for axis in range(3):
+        before += patches.normal[:, axis] * (cameras[:, axis, None] - patches.center[:, axis])
+    position, patch = np.nonzero(before > 0)
+    group = position * len(scene.objects) + patches.owner[patch]
+    whole = np.bincount(group, patches.area[patch], len(points) * len(scene.objects))
+    target = np.rint(patches.center).astype(np.int32)
+    seen = ~rays.cast(cameras[position], target[patch], solids_of(scene, rules))
+    near = nearness(scene, points, patches, rules).reshape(-1)
+    least = np.where(near, whole * rules.sliver, np.inf)
+    return _boxes_in_view(cameras, patches, position[seen], patch[seen], group[seen], least)
+
+
+def _boxes_in_view(
+    cameras: np.ndarray,
+    patches: Patches,
+    position: np.ndarray,
+    patch: np.ndarray,
+    group: np.ndarray,
+    least: np.ndarray,
+) -> Sight:
+    """Extents of the seen patches in every view, per position and object.
+
+    Args:
+        position, patch, group: [V] camera, patch and (camera, object) index of each patch that
+            nothing hides, sorted. least: [P * O] area in view from which an object is visible.
+    """
+    area, owner = patches.area[patch], patches.owner[patch]
+    center, corner, eye = (a.astype(np.float32) for a in (patches.center, patches.corner, cameras))
+    x, up, z = (center[patch, axis] - eye[position, axis] for axis in range(3))
+    corners, eyes = turned(corner[..., 0], corner[..., 2]), turned(eye[:, 0], eye[:, 2])
+    corners_up, eyes_up = np.ascontiguousarray(corner[..., 1]), np.ascontiguousarray(eye[:, 1])
+    parts = [_nothing()]
+    for heading, (right, ahead) in enumerate(turned(x, z)):
+        for horizon in range(HORIZONS):
+            height, depth = tilted(up, ahead, horizon)
+            rows = np.flatnonzero((np.abs(right) < depth) & (np.abs(height) < depth))
+            start = np.flatnonzero(np.diff(group[rows], prepend=-1))
+            if len(rows) == 0:
+                continue
+            across, over, along = (
+                np.take(table, patch[rows], axis=0) - np.take(at, position[rows])[:, None]
+                for table, at in (
+                    (corners[heading][0], eyes[heading][0]),
+                    (corners_up, eyes_up),
+                    (corners[heading][1], eyes[heading][1]),
+                )
+            )
+            first = rows[start]
+            state = poses.join(position[first], heading, horizon)
+            box = _extents(across, *tilted(over, along, horizon), start)
+            visible = np.add.reduceat(area[rows], start) >= least[group[first]]
+            parts.append(Sight(state, owner[first], box, visible))
+    order = np.lexsort(
+        (np.concatenate([p.owner for p in parts]), np.concatenate([p.state for p in parts]))
+    )
+    return Sight(
+        state=np.concatenate([p.state for p in parts])[order].astype(np.int32),
+        owner=np.concatenate([p.owner for p in parts])[order].astype(np.int32),
+        box=np.concatenate([p.box for p in parts])[order],
+        visible=np.concatenate([p.visible for p in parts])[order],
+    )
+
+
+def _nothing() -> Sight:
+    none = np.zeros(0, np.int32)
+    return Sight(none, none, np.zeros((0, 4), np.int16), np.zeros(0, bool))
+
+
+def _extents(
+    across: np.ndarray, height: np.ndarray, depth: np.ndarray, start: np.ndarray
+) -> np.ndarray:
+    """Image boxes [M, 4] around the corners [V, 4] of the patches from each of `start` [M] on."""
+    x, y = project(across, depth), -project(height, depth)
+    sides = [
+        op.reduceat(op(op(a[:, 0], a[:, 1]), op(a[:, 2], a[:, 3])), start)
+        for op, a in ((np.minimum, x), (np.minimum, y), (np.maximum, x), (np.maximum, y))
+    ]
+    middle = IMAGE * SUBPIXEL // 2
+    return np.rint(np.clip(np.stack(sides, axis=1), -middle, middle)).astype(np.int16) + middle

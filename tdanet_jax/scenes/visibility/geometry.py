@@ -1,0 +1,116 @@
+"""Boxes, their faces, and the graph of reachable points.
+
+World axes are AI2-THOR's: x right, y up, z forward, left-handed; metres. Headings count from
++z clockwise seen from above (90 degrees looks along +x), in steps of 45 degrees.
+"""
+
+import numpy as np
+
+from tdanet_jax import poses
+from tdanet_jax.poses import HORIZONS, ROTATIONS
+from tdanet_jax.scenes.scene import GRID
+
+# Grid steps of MoveAhead along each heading; a diagonal one moves a step on both axes.
+STEPS = np.array([(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)])
+
+
+def box_frame(box: np.ndarray, corners: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """An object's tightest known box as origin corner [3] and edge vectors [3, 3] (rows).
+
+    Args:
+        box: [2, 3] axis-aligned box. corners: [8, 3] of the oriented box in AI2-THOR's order
+            (bottom face around, then top face around), if it is known.
+    """
+    if corners is None:
+        return box[0], np.diag(box[1] - box[0])
+    return corners[0], corners[[1, 4, 3]] - corners[0]
+
+
+def next_positions(points: np.ndarray) -> np.ndarray:
+    """Where MoveAhead leads from each of `points` [P, 3] along each heading: [P, 8] int32.
+
+    A step to a place that is not reachable leaves the agent where it is.
+    """
+    cells = np.rint((points - points[0])[:, [0, 2]] / GRID).astype(np.int64)
+    index = {(int(x), int(z)): i for i, (x, z) in enumerate(cells)}
+    result = np.empty((len(points), ROTATIONS), np.int32)
+    for i, (x, z) in enumerate(cells):
+        for heading, (dx, dz) in enumerate(STEPS):
+            result[i, heading] = index.get((int(x + dx), int(z + dz)), i)
+    return result
+
+
+def transitions(next_position: np.ndarray) -> np.ndarray:
+    """State after each of the five moving actions: [S, 5] int32, S = P * 16.
+
+    Columns are MoveAhead, RotateLeft, RotateRight, LookUp, LookDown.
+    """
+    position, rotation, horizon = poses.split(np.arange(next_position.size * HORIZONS))
+    columns = [
+        poses.join(next_position[position, rotation], rotation, horizon),
+        poses.join(position, (rotation - 1) % ROTATIONS, horizon),
+        poses.join(position, (rotation + 1) % ROTATIONS, horizon),
+        poses.join(position, rotation, 0),
+        poses.join(position, rotation, 1),
+    ]
+    return np.stack(columns, axis=1).astype(np.int32)
+
+
+def action_distances(successor: np.ndarray, goals: np.ndarray) -> np.ndarray:
+    """Fewest actions from each state to a goal state, -1 where there is no way.
+
+    Args:
+        successor: [S, A] int, state after each action.
+        goals: [S, G] bool, goal states of each of G <= 64 targets.
+
+    Returns:
+        [S, G] int16. All targets advance together: one bit of a word each.
+    """
+    count = goals.shape[1]
+    bits = np.uint64(1) << np.arange(count, dtype=np.uint64)
+    seen = np.where(goals, bits, np.uint64(0)).sum(axis=1, dtype=np.uint64)
+    result = np.where(goals, 0, -1).astype(np.int16)
+    frontier, step = seen, 0
+    while frontier.any():
+        step += 1
+        arriving = np.bitwise_or.reduce(frontier[successor], axis=1) & ~seen
+        state = np.flatnonzero(arriving)
+        hit = (arriving[state, None] & bits) != 0
+        result[state] = np.where(hit, np.int16(step), result[state])
+        seen = seen | arriving
+        frontier = arriving
+    return result
+
+
+def lattice(origins: np.ndarray, edges: np.ndarray, steps: int = 8) -> np.ndarray:
+    """Centres of the steps^3 cells of each of O boxes: [O, K, 3].
+
+    Args:
+        origins: [O, 3] a corner of each box. edges: [O, 3, 3] its edge vectors.
+    """
+    share = (np.arange(steps) + 0.5) / steps
+    cells = np.stack(np.meshgrid(share, share, share, indexing="ij"), axis=-1).reshape(-1, 3)
+    return origins[:, None] + (cells[None, :, :, None] * edges[:, None]).sum(axis=2)
+
+
+def frustum_rotation(points: np.ndarray, visible: np.ndarray, camera: np.ndarray) -> int:
+    """The likeliest rotation, of 0, 90, 180, 270 degrees, of a level camera with 90-degree view.
+
+    Only the view's four planes count: an object is taken to be visible as probably as a random
+    point of it lies in the view. Occlusion plays no part, so that the choice does not depend on
+    the rules that are judged by these flags. Ties go to the least rotation.
+
+    Args:
+        points: [O, K, 3] points spread over each object within reach, metres.
+        visible: [O] bool, AI2-THOR's flags. camera: [3] metres.
+    """
+    offset = points - camera
+    scores = []
+    for heading in range(0, ROTATIONS, 2):
+        x, z = STEPS[heading]
+        depth = offset[..., 0] * x + offset[..., 2] * z
+        side = offset[..., 0] * z - offset[..., 2] * x
+        inside = (np.abs(side) < depth) & (np.abs(offset[..., 1]) < depth)
+        share = np.clip(inside.mean(axis=1), 0.002, 0.9)
+        scores.append(np.log(np.where(visible, share, 1 - share)).sum())
+    return int(np.argmax(np.round(scores, 6))) * 90

@@ -1,0 +1,191 @@
+"""From a room's objects to what rays are cast at and what stops them, as the rules say."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tdanet_jax.scenes.errors import SceneError
+from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.scenes.visibility.geometry import box_frame
+from tdanet_jax.scenes.visibility.rays import CLOSED, FARTHEST, MOST_SOLIDS, OPEN, TURN_BITS, Solids
+from tdanet_jax.scenes.visibility.rules import Rules
+
+THIN = 1e-3  # metres; edges shorter than this have no direction of their own
+CELL = 0.25  # metres, of the plan in which voids are looked for
+BELOW, ABOVE = 1.0, 3.0  # metres under and over the agent's y that walls reach
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """The pieces that a room's object surfaces are divided into; Q of them, sorted by object."""
+
+    owner: np.ndarray  # [Q] index of the object
+    center: np.ndarray  # [Q, 3] float64 millimetres
+    corner: np.ndarray  # [Q, 4, 3] float64 millimetres
+    normal: np.ndarray  # [Q, 3] float64, outward, its length without meaning
+    area: np.ndarray  # [Q] int64 square millimetres
+
+
+def millimetres(lengths: np.ndarray) -> np.ndarray:
+    """Lengths in metres as whole millimetres, int32."""
+    return np.rint(np.asarray(lengths) * 1000).astype(np.int32)
+
+
+def fronts_of(item: SceneObject, points: np.ndarray, nearly: float) -> list[tuple[int, int]]:
+    """Axis (0 or 2) and side (0 or 1) of the upright faces of an object's box that look at a room.
+
+    That is the face with the nearest of `points` [P, 3] straight before it, and those whose
+    nearest is at most `nearly` farther. What a point lies beside the face counts double.
+    """
+    found = []
+    for axis, across in ((0, 2), (2, 0)):
+        beside = np.maximum(item.box[0, across] - points[:, across], 0)
+        beside = np.maximum(beside, points[:, across] - item.box[1, across])
+        for side in (0, 1):
+            before = (points[:, axis] - item.box[side, axis]) * (2 * side - 1)
+            gaps = (before + 2 * beside)[before > 0]
+            if len(gaps):
+                found.append((float(gaps.min()), axis, side))
+    least = min(found, default=(0.0, 0, 0))[0]
+    return [(axis, side) for gap, axis, side in found if gap <= least + nearly]
+
+
+def patches_of(scene: Scene, rules: Rules) -> Patches:
+    """Divide the visible faces of every object into patches."""
+    parts = []
+    for index, item in enumerate(scene.objects):
+        origin, edges = box_frame(item.box, item.corners)
+        lengths = np.sqrt((edges * edges).sum(axis=1))
+        fine, coarse = np.minimum(lengths, 1.0), np.maximum(lengths - 1.0, 0.0)
+        counts = np.maximum(np.ceil((fine + coarse / 3) / rules.patch), 2).astype(int)
+        faces = [(axis, side) for axis in range(3) for side in (0, 1)]
+        if item.object_class in rules.fronts:
+            faces = fronts_of(item, scene.points, rules.nearly)
+        for axis, side in faces:
+            u, v = (axis + 1) % 3, (axis + 2) % 3
+            grid = _unit_grid(counts[u], counts[v])
+            corner = origin + side * edges[axis]
+            corner = corner + grid[..., :1] * edges[u] + grid[..., 1:] * edges[v]
+            area = np.rint(lengths[u] * lengths[v] / len(grid) * 1e6)
+            if item.object_class in rules.carved:
+                corner = corner[~stood_on(corner.mean(axis=1), scene.points, rules.standing)]
+            normal = np.broadcast_to(edges[axis] * (2 * side - 1), (len(corner), 3))
+            parts.append((index, corner, normal, area))
+    sizes = [len(corner) for _, corner, _, _ in parts]
+    corners = np.concatenate([corner for _, corner, _, _ in parts]) * 1000
+    return Patches(
+        owner=np.repeat([index for index, *_ in parts], sizes),
+        center=corners.mean(axis=1),
+        corner=corners,
+        normal=np.concatenate([normal for _, _, normal, _ in parts]),
+        area=np.repeat([area for *_, area in parts], sizes).astype(np.int64),
+    )
+
+
+def stood_on(places: np.ndarray, points: np.ndarray, radius: float) -> np.ndarray:
+    """Whether each of `places` [N, 3] is within `radius` of one of `points`, horizontally."""
+    offset = (places[:, None] - points)[:, :, [0, 2]]
+    return ((offset * offset).sum(axis=-1) < radius**2).any(axis=1)
+
+
+def _unit_grid(m: int, n: int) -> np.ndarray:
+    """Corners of an m x n division of the unit square: [m * n, 4, 2]."""
+    i, j = np.meshgrid(np.arange(m), np.arange(n), indexing="ij")
+    low = np.stack([i, j], axis=-1).reshape(-1, 1, 2)
+    return (low + np.array([(0, 0), (0, 1), (1, 0), (1, 1)])) / np.array([m, n])
+
+
+def solids_of(scene: Scene, rules: Rules) -> Solids:
+    """The boxes of a room that hide things.
+
+    Raises:
+        SceneError: the room is too large or too full for exact 32-bit ray casting.
+    """
+    aligned = [(box, OPEN) for box in void_boxes(scene, rules)]
+    turned = []
+    for item in scene.objects:
+        if item.object_class in rules.frames:
+            continue
+        closed = item.object_class in rules.closed and not item.is_open
+        kind, inset = (CLOSED, 0.0) if closed else (OPEN, rules.inset)
+        origin, edges = box_frame(item.box, item.corners)
+        lengths = np.sqrt((edges * edges).sum(axis=1))
+        if item.object_class in rules.plates:
+            box = item.box.copy()
+            box[0, 1] = max(box[0, 1], box[1, 1] - rules.thickness)
+            aligned.append((box, kind))
+        elif np.count_nonzero(np.abs(edges) > THIN) <= 3 or lengths.min() < THIN:
+            rim = inset * (item.box[1] - item.box[0])
+            aligned.append((item.box + np.stack([rim, -rim]), kind))
+        else:
+            turned.append((origin + edges.sum(axis=0) / 2, edges, lengths, inset, kind))
+    boxes = [box for box, _ in aligned]
+    boxes += [np.stack([-lengths, lengths]) * (0.5 - inset) for _, _, lengths, inset, _ in turned]
+    corners = millimetres(np.reshape(boxes, (-1, 2, 3)))
+    _check_size(scene, len(boxes))
+    none = len(aligned)
+    turns = [np.eye(3)] * none + [edges / lengths[:, None] for _, edges, lengths, _, _ in turned]
+    return Solids(
+        lo=corners[:, 0],
+        hi=corners[:, 1],
+        kind=np.array([kind for _, kind in aligned] + [t[4] for t in turned], np.int32),
+        origin=millimetres(np.reshape([np.zeros(3)] * none + [t[0] for t in turned], (-1, 3))),
+        turn=np.rint(np.reshape(turns, (-1, 3, 3)) * (1 << TURN_BITS)).astype(np.int32),
+        aligned=none,
+    )
+
+
+def _check_size(scene: Scene, solids: int) -> None:
+    places = np.concatenate([scene.points, *(item.box for item in scene.objects)])
+    extent = 1000 * np.linalg.norm(places.max(axis=0) - places.min(axis=0))
+    if extent > FARTHEST:
+        raise SceneError(f"{scene.name}: {extent / 1000:.1f} m across, {FARTHEST / 1000} m allowed")
+    if solids > MOST_SOLIDS:
+        raise SceneError(f"{scene.name}: {solids} occluding objects, {MOST_SOLIDS} allowed")
+
+
+def void_boxes(scene: Scene, rules: Rules) -> list[np.ndarray]:
+    """Boxes [2, 3] over the parts of the plan far from all objects and points: walls, or what
+    lies behind them.
+
+    The plan is cut into cells; runs of void cells along x make one box each, equal runs in
+    successive rows are joined.
+    """
+    boxes = np.array([item.box for item in scene.objects])[:, :, [0, 2]]
+    boxes = boxes[np.isfinite(boxes).all(axis=(1, 2))]  # imported objects may have no known place
+    ground = scene.points[:, [0, 2]]
+    low = np.minimum(boxes[:, 0].min(axis=0, initial=np.inf), ground.min(axis=0))
+    high = np.maximum(boxes[:, 1].max(axis=0, initial=-np.inf), ground.max(axis=0))
+    counts = np.maximum(np.ceil((high - low) / CELL), 1).astype(int)
+    cells = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1)
+    center = low + (cells.reshape(-1, 1, 2) + 0.5) * CELL
+    gap = np.maximum(np.maximum(boxes[:, 0] - center, center - boxes[:, 1]), 0)
+    near_object = ((gap * gap).sum(axis=-1) < rules.void**2).any(axis=1)
+    offset = ground - center
+    near_point = ((offset * offset).sum(axis=-1) < rules.void**2).any(axis=1)
+    void = ~(near_object | near_point).reshape(counts)
+    bottom, top = scene.points[:, 1].min() - BELOW, scene.points[:, 1].max() + ABOVE
+    return [
+        np.array(
+            [
+                (low[0] + i * CELL, bottom, low[1] + first * CELL),
+                (low[0] + j * CELL, top, low[1] + last * CELL),
+            ]
+        )
+        for i, j, first, last in _runs(void)
+    ]
+
+
+def _runs(mask: np.ndarray) -> list[tuple[int, int, int, int]]:
+    """Rectangles [i, j) x [first, last) that cover the true cells of `mask` once each."""
+    done: list[tuple[int, int, int, int]] = []
+    growing: dict[tuple[int, int], int] = {}
+    for column in range(mask.shape[1] + 1):
+        line = mask[:, column] if column < mask.shape[1] else np.zeros(mask.shape[0], bool)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], line, [False]]).astype(int)))
+        runs = {(int(i), int(j)) for i, j in edges.reshape(-1, 2)}
+        for run in [run for run in growing if run not in runs]:
+            done.append((*run, growing.pop(run), column))
+        for run in sorted(runs):
+            growing.setdefault(run, column)
+    return done

@@ -1,0 +1,1 @@
+"""What an agent perceives: detections, odometry, triangulation."""

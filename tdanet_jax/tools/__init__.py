@@ -1,0 +1,1 @@
+"""Benchmarks, and the script that builds the bundled files."""

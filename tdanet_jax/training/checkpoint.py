@@ -1,0 +1,271 @@
+"""Checkpoints of a run (Orbax): everything that is needed to go on bit for bit.
+
+`DIR/checkpoints/<updates>/` holds `state` (parameters, optimiser, episodes in progress, recurrent
+state, random key, counters; plain arrays, whichever devices they lay on), `meta` (JSON: format
+version, training time, data version) and `SHA256SUMS`, the checksums of all its files
+(`sha256sum -c SHA256SUMS` checks them, too).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import logging
+import shutil
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from tdanet_jax.io import assets, files
+from tdanet_jax.training import history
+from tdanet_jax.training.history import Snapshot
+from tdanet_jax.training.learner import TrainState
+
+FORMAT = 1
+FOLDER = "checkpoints"
+CHECKSUMS = "SHA256SUMS"
+KEPT = 2
+
+# Orbax narrates every file it touches, and every error that it raises besides.
+logging.getLogger("absl").setLevel(logging.CRITICAL)
+
+
+class NewerFormat(ValueError):
+    """A checkpoint that only a newer version can read."""
+
+
+def newest(run: Path) -> Snapshot:
+    """The network of a run's newest checkpoint, or of a folder that was passed on.
+
+    Raises:
+      ValueError: the folder holds none, or none can be read.
+    """
+    if is_passed_on(run):
+        return history.read(run / history.NETWORK)
+    checkpoints = Checkpoints(run)
+    if checkpoints.latest() is None:
+        raise ValueError(f"{run / FOLDER}: no checkpoint")
+    return checkpoints.snapshot()
+
+
+def is_passed_on(run: Path) -> bool:
+    """Whether a folder holds a trained network and nothing to go on training with."""
+    return (run / history.NETWORK).exists()
+
+
+class Checkpoints:
+    """The checkpoints of one run's folder."""
+
+    def __init__(self, run: Path) -> None:
+        self.folder = (run / FOLDER).absolute()
+        # Every process reads for itself, and one alone writes: none waits for the others.
+        here = jax.process_index()
+        alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
+        self._orbax = ocp.Checkpointer(
+            ocp.CompositeCheckpointHandler(
+                composite_options=ocp.CompositeOptions(multiprocessing_options=alone),
+                state=ocp.StandardCheckpointHandler(multiprocessing_options=alone),
+                meta=ocp.JsonCheckpointHandler(multiprocessing_options=alone),
+            ),
+            multiprocessing_options=alone,
+        )
+
+    def save(self, state: TrainState, meta: dict[str, Any]) -> None:
+        """Writes a checkpoint; it appears complete or not at all. The newest two are kept.
+
+        Raises:
+          ValueError: it cannot be written; those before it are as they were.
+        """
+        updates = int(state.updates)
+        path = self.folder / str(updates)
+        fresh = self.folder / f"{files.PARTIAL}{updates}"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            shutil.rmtree(fresh, ignore_errors=True)
+            content = jax.device_get(_plain(state))
+            _check_space(self.folder, content)
+            with _quiet_threads():
+                self._orbax.save(
+                    fresh,
+                    args=ocp.args.Composite(
+                        state=ocp.args.StandardSave(content),
+                        meta=ocp.args.JsonSave({**meta, "format": FORMAT}),
+                    ),
+                )
+            sums = "".join(f"{sha}  {name}\n" for name, sha in _checksums(fresh).items())
+            (fresh / CHECKSUMS).write_text(sums)
+            shutil.rmtree(path, ignore_errors=True)  # only a damaged one can be there
+            fresh.rename(path)
+        except Exception as error:  # Orbax and TensorStore raise many kinds, for a full disk too
+            with contextlib.suppress(OSError):  # its threads may still write into it
+                files.remove_partial(self.folder)
+            kept = f"the one before it is {self.latest()}" if self._steps() else "there is no other"
+            reason = f"checkpoint not written ({_reason(error)}); {kept}"
+            raise ValueError(f"{path}: {reason}") from error
+        # Anything ahead of this one is what could not be read when the run went on from behind it.
+        keep = [step for step in self._steps() if step <= updates][:KEPT]
+        for step in set(self._steps()) - set(keep):
+            shutil.rmtree(self.folder / str(step))
+        _give_memory_back()
+
+    def latest(self) -> int | None:
+        """The number of updates of the newest complete checkpoint."""
+        return next(iter(self._steps()), None)
+
+    def restore(self, make_state: Callable[[], TrainState]) -> tuple[TrainState, dict[str, Any]]:
+        """The newest checkpoint that can be read; a damaged one is passed over with a warning.
+
+        Args:
+          make_state: makes a state of the right shapes; only traced, never run.
+
+        Raises:
+          ValueError: there is no checkpoint, or none that fits this configuration.
+        """
+        shapes = jax.eval_shape(_plain, jax.eval_shape(make_state))
+        blank = jax.tree.map(lambda x: np.empty(x.shape, x.dtype), shapes)
+        state, meta = self._read(blank)
+        return state.replace(key=jax.random.wrap_key_data(state.key)), meta
+
+    def snapshot(self) -> Snapshot:
+        """The network of the newest checkpoint, without knowing anything else of the run.
+
+        Raises:
+          ValueError: there is no checkpoint, or none can be read.
+        """
+        state, meta = self._read(None)
+        return Snapshot(
+            weights=state["params"],
+            updates=int(state["updates"]),
+            episodes=int(state["episodes"]),
+            seconds=float(meta["seconds"]),
+            point=0,
+            data_version=meta["data_version"],
+        )
+
+    def _steps(self) -> list[int]:
+        """The complete checkpoints, newest first."""
+        names = (path.name for path in self.folder.glob("*") if path.is_dir())
+        return sorted((int(name) for name in names if name.isdecimal()), reverse=True)
+
+    def _read(self, blank: Any) -> tuple[Any, dict[str, Any]]:
+        faults: list[Exception] = []
+        for step in self._steps():
+            try:
+                found = self._read_one(self.folder / str(step), blank)
+            except NewerFormat:
+                raise  # it is sound: no older one shall be taken in its place
+            except (ValueError, OSError) as error:
+                faults.append(error)
+                continue
+            for fault in faults:
+                warnings.warn(f"{fault}; taking checkpoint {step} in its place", stacklevel=4)
+            return found
+        raise faults[0] if faults else ValueError(f"{self.folder}: no checkpoint")
+
+    def _read_one(self, path: Path, blank: Any) -> tuple[Any, dict[str, Any]]:
+        _verify(path)
+        try:
+            meta = self._orbax.restore(path, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
+            written = meta["meta"]["format"]
+            if written <= FORMAT:
+                read = self._orbax.restore(
+                    path, args=ocp.args.Composite(state=ocp.args.StandardRestore())
+                )
+                state = read["state"] if blank is None else _fitted(read["state"], blank)
+        except Exception as error:  # Orbax raises many kinds for a damaged folder
+            raise ValueError(f"{path}: unreadable checkpoint ({_reason(error)})") from error
+        if written > FORMAT:
+            raise NewerFormat(
+                f"{path}: checkpoint of format {written}, this version reads up to {FORMAT}: "
+                "a newer tdanet_jax wrote it"
+            )
+        return state, dict(meta["meta"])
+
+
+def _fitted(values: Any, blank: Any) -> Any:
+    """The tree of `blank` with the values that have the same names in another tree.
+
+    By name, because a later version of the state may have further parts that are None here, which
+    the files of an earlier one do not mention.
+
+    Raises:
+      ValueError: names, shapes or types differ.
+    """
+    found = {_name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(values)}
+    wanted = {_name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(blank)}
+    for name in sorted(found.keys() ^ wanted.keys()):
+        raise ValueError(f"{name} is {'missing' if name in wanted else 'of no use here'}")
+    for name, leaf in wanted.items():
+        one, other = (f"{x.dtype}{x.shape}" for x in (found[name], leaf))
+        if one != other:
+            raise ValueError(f"{name} is {one}, not {other}")
+    return jax.tree.unflatten(
+        jax.tree.structure(blank), [np.asarray(found[name]) for name in wanted]
+    )
+
+
+def _name(path: tuple[Any, ...]) -> str:
+    """params/actor/kernel, whether the parts are fields, keys or places."""
+    return jax.tree_util.keystr(path, simple=True, separator="/")
+
+
+@contextlib.contextmanager
+def _quiet_threads() -> Iterator[None]:
+    """Orbax's threads hand their errors to the caller; inside, they do not print them besides."""
+    before = threading.excepthook, sys.unraisablehook
+    threading.excepthook, sys.unraisablehook = lambda error: None, lambda error: None
+    try:
+        yield
+    finally:
+        threading.excepthook, sys.unraisablehook = before
+
+
+def _give_memory_back() -> None:
+    """Returns freed memory to the system. Each thread that writes would keep some (glibc)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _check_space(folder: Path, content: Any) -> None:
+    """Raises OSError if the disk cannot hold a state. Orbax finds out, too, but half-way."""
+    needed = sum(array.nbytes for array in jax.tree.leaves(content))
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        megabytes = f"{needed / 1e6:.1f} MB needed, {free / 1e6:.1f} MB free"
+        raise OSError(f"No space left on device: {megabytes}")
+
+
+def _plain(state: TrainState) -> TrainState:
+    """The state with its random key as integers, which is what a file can hold."""
+    return state.replace(key=jax.random.key_data(state.key))
+
+
+def _reason(error: Exception) -> str:
+    """The first line of an error's message."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    """sha256 by relative path of all files in a checkpoint."""
+    found = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != CHECKSUMS)
+    return {path.relative_to(folder).as_posix(): assets.sha256(path) for path in found}
+
+
+def _verify(path: Path) -> None:
+    """Raises ValueError if a file is not the one that was written. Old ones have no checksums."""
+    listed = path / CHECKSUMS
+    if not listed.exists():
+        return
+    lines = listed.read_bytes().decode(errors="replace").splitlines()
+    expected = {name: sha for sha, _, name in (line.partition("  ") for line in lines)}
+    found = _checksums(path)
+    wrong = [n for n in expected.keys() | found.keys() if expected.get(n) != found.get(n)]
+    if wrong:
+        raise ValueError(f"{path}: damaged checkpoint ({len(wrong)} files differ from {CHECKSUMS})")

@@ -1,0 +1,136 @@
+"""The devices of a run: environments are split over them, everything else lies on each.
+
+XLA partitions the compiled update by where its arguments lie, so the learner knows nothing of
+devices. Random numbers belong to an environment's index in the whole batch: one update on many
+devices is the same update as on one, but for the order in which gradients are added.
+
+Several machines, or several processes on one, run the same command with the variables
+JAX_COORDINATOR_ADDRESS (host:port of the first), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from tdanet_jax.scenes import cache
+from tdanet_jax.training.learner import TrainState
+
+AXIS = "environments"
+ADDRESS, PROCESSES, PROCESS = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
+#: Compiled programs that are kept between runs, in bytes.
+COMPILED_SIZE = 2**30
+
+
+def keep_compiled() -> None:
+    """Keeps compiled programs in the cache folder: a second start need not compile again."""
+    folder = cache.folder() / "compiled"
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_compilation_cache_max_size", COMPILED_SIZE)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def connect(count: int = 1) -> Mesh:
+    """Joins the other processes, if any, and lays out the devices. Before anything else of JAX.
+
+    Args:
+      count: devices to use in this process. A CPU is split into as many.
+
+    Raises:
+      ValueError: there are fewer devices, or the variables of a process are incomplete.
+    """
+    if count < 1:
+        raise ValueError(f"--devices {count}: must be positive")
+    if count > 1:  # a CPU that is in use already is no longer split: too few devices, below
+        with contextlib.suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", count)
+    if os.environ.get(ADDRESS):
+        try:
+            processes, process = int(os.environ[PROCESSES]), int(os.environ[PROCESS])
+        except (KeyError, ValueError):
+            raise ValueError(f"{ADDRESS} is set: {PROCESSES} and {PROCESS} must be, too") from None
+        # Processes on CPUs wait for each other for ever if each orders its sums as it likes.
+        flag = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}"
+        jax.distributed.initialize(os.environ[ADDRESS], processes, process)
+    if jax.local_device_count() < count:
+        raise ValueError(f"--devices {count}: this machine has {jax.local_device_count()}")
+    chosen: list[Any] = []
+    for process in range(jax.process_count()):
+        chosen += [d for d in jax.devices() if d.process_index == process][:count]
+    return Mesh(np.array(chosen), (AXIS,))
+
+
+def first() -> Mesh:
+    """The first device alone."""
+    return Mesh(np.array(jax.local_devices()[:1]), (AXIS,))
+
+
+def is_lead() -> bool:
+    """Whether this process writes files and prints; always true for a process on its own."""
+    return jax.process_index() == 0
+
+
+def from_lead(value: float) -> float:
+    """The lead process's value, in every process."""
+    if jax.process_count() == 1:
+        return value
+    return float(multihost_utils.broadcast_one_to_all(np.float64(value)))
+
+
+def anywhere(flag: bool) -> bool:
+    """Whether the flag is set in any process."""
+    if jax.process_count() == 1:
+        return flag
+    return bool(np.any(multihost_utils.process_allgather(np.array(flag))))
+
+
+def everywhere(mesh: Mesh) -> NamedSharding:
+    """On every device as a whole."""
+    return NamedSharding(mesh, PartitionSpec())
+
+
+def whole(tree: Any, mesh: Mesh) -> Any:
+    """The arrays with every part in this process, which a file can be written from."""
+    if jax.process_count() == 1:
+        return tree
+    return jax.jit(lambda x: x, out_shardings=everywhere(mesh))(tree)
+
+
+def wait_for_all(reason: str) -> None:
+    """Returns when every process has come here."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(reason)
+
+
+def split(mesh: Mesh) -> NamedSharding:
+    """One part of the first axis on every device."""
+    return NamedSharding(mesh, PartitionSpec(AXIS))
+
+
+def layout(state: Any, mesh: Mesh) -> Any:
+    """Where each array of a `TrainState` lies: what has a row per environment is split.
+
+    Raises:
+      ValueError: the environments cannot be divided evenly.
+    """
+    environments = state.fresh.shape[0]
+    if environments % mesh.size:
+        raise ValueError(
+            f"--num-envs {environments}: must be a multiple of the {mesh.size} devices"
+        )
+
+    def place(tree: Any, sharding: NamedSharding) -> Any:
+        return jax.tree.map(lambda _: sharding, tree)
+
+    per_environment: tuple[str, ...] = TrainState.PER_ENVIRONMENT
+    return place(state, everywhere(mesh)).replace(
+        **{name: place(getattr(state, name), split(mesh)) for name in per_environment}
+    )

@@ -1,0 +1,139 @@
+"""The parameters of a run at fixed shares of its budget, for learning curves and later analysis.
+
+`DIR/history/<updates>.npz` holds the parameters alone, by their path in the network
+(`encoder/linear2/kernel`), and where the run was, behind names that begin with @.
+Checkpoints, which resume a run, hold three times as much, and only the newest are kept. A folder
+that is passed on has neither, but one such file beside its configuration, `NETWORK`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from flax import traverse_util
+
+from tdanet_jax.io import files
+
+FOLDER = "history"
+SUFFIX = ".npz"
+#: The network of a folder that is passed on (`saved.share`).
+NETWORK = "network.npz"
+#: Version of the files' layout; `read` refuses a newer one.
+FORMAT = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Snapshot:
+    """A network at one moment of its training.
+
+    Attributes:
+      weights: its parameters.
+      updates, episodes: updates and training episodes done.
+      seconds: training time.
+      point: which point of the history it is, from 1; 0 outside the history.
+      data_version: of the scene tables that it trained on.
+    """
+
+    weights: Any
+    updates: int
+    episodes: int
+    seconds: float
+    point: int
+    data_version: str
+
+
+_WHERE = {field.name for field in dataclasses.fields(Snapshot)} - {"weights"}
+
+
+def due(before: float, after: float, points: int) -> int:
+    """The newest point that lies between two shares of the budget, or 0 if there is none.
+
+    Point k of n is reached at the share k / n; the last is the end of the budget.
+    """
+    reached, passed = (min(math.floor(share * points), points) for share in (after, before))
+    return reached if reached > passed else 0
+
+
+def write(run: Path, snapshot: Snapshot) -> Path:
+    """Adds a point; the file appears complete or not at all."""
+    path = run / FOLDER / f"{snapshot.updates:08d}{SUFFIX}"
+    path.parent.mkdir(exist_ok=True)
+    save(path, snapshot)
+    return path
+
+
+def save(path: Path, snapshot: Snapshot, half: bool = False) -> None:
+    """Writes a snapshot; the file appears complete or not at all.
+
+    Args:
+      half: keeps 16 bits of each parameter (float16).
+
+    Raises:
+      ValueError: a parameter is too large for that.
+    """
+    arrays = traverse_util.flatten_dict(jax.device_get(snapshot.weights), sep="/")
+    if half:
+        if any(abs(array).max(initial=0) > np.finfo(np.float16).max for array in arrays.values()):
+            raise ValueError(f"{path}: a parameter does not fit into float16")
+        arrays = {name: array.astype(np.float16) for name, array in arrays.items()}
+    where = {name: getattr(snapshot, name) for name in _WHERE} | {"format": FORMAT}
+    content: dict[str, Any] = arrays | {f"@{name}": np.array(v) for name, v in where.items()}
+    with files.replacing(path) as fresh, fresh.open("wb") as file:
+        np.savez(file, **content)
+
+
+def read(path: Path) -> Snapshot:
+    """One point.
+
+    Raises:
+      ValueError: the file is missing, damaged or of a newer format; the message names it.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            content = {name: data[name] for name in data.files}
+            where = {name[1:]: content.pop(name).item() for name in data.files if name[0] == "@"}
+        content = {name: array.astype(np.float32) for name, array in content.items()}
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file") from None
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: unreadable ({str(error).splitlines()[0]})") from error
+    written = where.pop("format", None)
+    if written is not None and written > FORMAT:
+        raise ValueError(
+            f"{path}: format {written}, this version reads {FORMAT}: a newer tdanet_jax wrote it"
+        )
+    if written is None or where.keys() != _WHERE:
+        raise ValueError(f"{path}: not a point of a run's history")
+    return Snapshot(weights=traverse_util.unflatten_dict(content, sep="/"), **where)
+
+
+def checksums(path: Path) -> list[tuple[str, int]]:
+    """Name and checksum (CRC-32) of every array of a point, from the file's directory alone.
+
+    Raises:
+      ValueError: the file is missing or damaged; the message names it.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return [(entry.filename, entry.CRC) for entry in archive.infolist()]
+    except (OSError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: unreadable ({error})") from error
+
+
+def points(run: Path) -> list[Path]:
+    """The files of a run's history, oldest first."""
+    return sorted(path for path in (run / FOLDER).glob(f"*{SUFFIX}") if path.stem.isdecimal())
+
+
+def drop_after(run: Path, updates: int) -> None:
+    """Deletes the points behind a checkpoint: their updates will be done again."""
+    files.remove_partial(run / FOLDER)
+    for path in points(run):
+        if int(path.stem) > updates:
+            path.unlink()

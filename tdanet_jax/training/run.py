@@ -1,0 +1,339 @@
+"""A training run on disk: chunks of updates, metrics, checkpoints, and going on after a stop."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from tdanet_jax.config import TrainConfig
+from tdanet_jax.env.dynamics import EnvParams
+from tdanet_jax.io import files
+from tdanet_jax.task import Task
+from tdanet_jax.training import devices, history, learner
+from tdanet_jax.training.checkpoint import Checkpoints
+from tdanet_jax.training.learner import TrainState
+
+METRICS_FILE = "metrics.jsonl"
+
+Row = dict[str, Any]
+
+
+class Run:
+    """A run in its folder. `state` is where it is, `seconds` the training time so far."""
+
+    def __init__(
+        self,
+        folder: Path,
+        config: TrainConfig,
+        task: Task,
+        mesh: Mesh | None = None,
+    ) -> None:
+        """The run in `folder`, new or as its newest checkpoint has it.
+
+        Args:
+          mesh: the devices that the environments are split over; by default the first alone.
+
+        Raises:
+          ValueError: the checkpoint does not fit the configuration or the rooms.
+        """
+        self.folder = folder
+        self.config = config
+        self.task = task
+        self.model = task.model
+        self.seconds = 0.0
+        self._mesh = mesh or devices.first()
+        self._shared = devices.everywhere(self._mesh)
+        self._words, self._params = jax.device_put(
+            (task.train_words, task.train_params), self._shared
+        )
+        shapes = jax.eval_shape(self._init, jax.random.key(0), self._words, self._params)
+        self._layout = devices.layout(shapes, self._mesh)
+        self.checkpoints = Checkpoints(folder)
+        self._saved: int | None = None  # updates of the checkpoint that holds the present state
+        self.state: TrainState = self._begin() if self.fresh else self._restore()
+        self._skipped_before = int(self.state.skipped)
+
+    @property
+    def fresh(self) -> bool:
+        """Whether the folder holds no checkpoint yet."""
+        return self.checkpoints.latest() is None
+
+    def _init(self, key: jax.Array, words: jax.Array, params: EnvParams) -> TrainState:
+        return learner.init(key, self.config.learner, self.model, words, params)
+
+    def _begin(self) -> TrainState:
+        key = jax.random.key(self.config.seed)
+        init = jax.jit(self._init, out_shardings=self._layout)
+        return init(key, self._words, self._params)
+
+    def _restore(self) -> TrainState:
+        def make_state() -> TrainState:
+            return self._init(jax.random.key(0), self._words, self._params)
+
+        state, meta = self.checkpoints.restore(make_state)
+        if meta["data_version"] != self.task.tables.data_version:
+            raise ValueError(
+                f"{self.folder}: trained on scene tables {meta['data_version']}, "
+                f"these are {self.task.tables.data_version}"
+            )
+        self.seconds = float(meta["seconds"])
+        self._saved = int(state.updates)
+        return jax.device_put(state, self._layout)
+
+    def save(self) -> None:
+        """Writes a checkpoint of the present state, unless there is one.
+
+        Raises:
+          ValueError: it cannot be written; those before it are as they were.
+        """
+        if self._saved != int(self.state.updates):
+            version = self.task.tables.data_version
+            state = devices.whole(self.state, self._mesh)
+            if devices.is_lead():
+                self.checkpoints.save(state, {"seconds": self.seconds, "data_version": version})
+            self._saved = int(self.state.updates)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return int(self.state.updates) * self.config.steps_per_update
+
+    @property
+    def progress(self) -> float:
+        """Share of the budget that is spent; the run is over at 1."""
+        return self.config.spent(self.steps, int(self.state.episodes), self.seconds)
+
+    def chunks(self, until: int | None = None) -> Iterator[Row]:
+        """Trains to the end of the budget; yields one row of metrics per chunk.
+
+        Of several processes, the lead alone writes files.
+
+        Compilation is not counted as training time. Stop iterating to stop training; `save` then
+        keeps what is done.
+
+        Args:
+          until: stop at this many updates already.
+
+        Raises:
+          ValueError: too many updates were skipped; the state is saved first.
+        """
+        journal = self._journal()
+        if self._over(until):
+            return
+        chunk = self._compile()
+        while not self._over(until):
+            before, shares, began = self.progress, self._shares(), time.perf_counter()
+            state, metrics = chunk(self.state, shares, self._words, self._params)
+            metrics = jax.device_get(metrics)
+            took = devices.from_lead(time.perf_counter() - began)
+            yield self._record(state, metrics, before, took, journal)
+            self._check_finite()
+
+    def _over(self, until: int | None) -> bool:
+        stopped = until is not None and int(self.state.updates) >= until
+        return stopped or self.progress >= 1.0
+
+    def _journal(self) -> Journal | None:
+        """The journal, for the lead alone.
+
+        What was written behind the checkpoint is dropped: its updates will be done again.
+        """
+        if not devices.is_lead():
+            return None
+        history.drop_after(self.folder, int(self.state.updates))
+        return Journal(self.folder / METRICS_FILE, int(self.state.updates))
+
+    def _shares(self) -> jax.Array:
+        """Shares of the budget that are spent before and behind the next chunk.
+
+        The chunk is taken to go as those before it did: known from the state alone, so that a run
+        that was stopped goes on with the same schedule.
+        """
+        before = self.progress
+        chunks_done = int(self.state.updates) / self.config.chunk_updates
+        pace = before / chunks_done if chunks_done else 0.0
+        return jnp.array([before, min(1.0, before + pace)], jnp.float32)
+
+    def _record(
+        self,
+        state: TrainState,
+        metrics: dict[str, np.ndarray],
+        before: float,
+        took: float,
+        journal: Journal | None,
+    ) -> Row:
+        """Goes on to the state behind a chunk; writes its row and, if one is due, a point."""
+        self.state = state
+        self.seconds += took
+        row = self._row(metrics, took)
+        if journal is not None:
+            journal.write(row)
+            self._keep_point(before)
+        return row
+
+    def _check_finite(self) -> None:
+        skipped = int(self.state.skipped) - self._skipped_before
+        if skipped >= self.config.max_skipped:
+            self.save()
+            raise ValueError(
+                f"{self.folder}: {skipped} updates skipped because the loss or gradient "
+                f"was not finite; the state is saved as checkpoint {int(self.state.updates)}"
+            )
+
+    def _keep_point(self, before: float) -> None:
+        """Adds to the history if the budget's share has passed a point since `before`.
+
+        The run does not depend on it: a point that cannot be written is left out with a warning.
+        """
+        point = history.due(before, self.progress, self.config.history)
+        if point:
+            try:
+                history.write(self.folder, self.snapshot(point))
+            except OSError as error:
+                warnings.warn(f"{error.filename}: left out ({error.strerror})", stacklevel=3)
+
+    def snapshot(self, point: int = 0) -> history.Snapshot:
+        """The network as it is now."""
+        return history.Snapshot(
+            weights=self.state.params,
+            updates=int(self.state.updates),
+            episodes=int(self.state.episodes),
+            seconds=self.seconds,
+            point=point,
+            data_version=self.task.tables.data_version,
+        )
+
+    def _compile(self) -> jax.stages.Compiled:
+        config, places = self.config, (self._layout, self._shared)
+        chunk = learner.make_train(config.learner, self.model, config.chunk_updates, places)
+        share = jnp.zeros(2, jnp.float32)
+        return chunk.lower(self.state, share, self._words, self._params).compile()
+
+    def _row(self, metrics: dict[str, np.ndarray], took: float) -> Row:
+        """One line of `metrics.jsonl`: means over the chunk's episodes, updates and steps.
+
+        None where there is nothing to take a mean of: no episode ended, or no number was finite.
+        """
+        steps = self.config.chunk_updates * self.config.steps_per_update
+        episodes = int(metrics["episodes"].sum())
+
+        def per_episode(name: str) -> float | None:
+            return float(metrics[name].sum()) / episodes if episodes else None
+
+        def over_updates(name: str) -> float | None:
+            finite = metrics[name][np.isfinite(metrics[name])]
+            return float(finite.mean()) if finite.size else None
+
+        return {
+            "updates": int(self.state.updates),
+            "steps": self.steps,
+            "episodes": int(self.state.episodes),
+            "success": per_episode("success_sum"),
+            "spl": per_episode("spl_sum"),
+            "length": per_episode("length_sum"),
+            "reward": float(metrics["reward_sum"].sum()) / steps,
+            **{name: over_updates(name) for name in _UPDATE_MEANS},
+            "held_steps": int(metrics["held_steps"].sum()),
+            "skipped": int(self.state.skipped),
+            "seconds": round(self.seconds, 3),
+            "steps_per_second": round(steps / took, 1),
+        }
+
+
+def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
+    """`Run.chunks` of several seeds of one configuration: their states stacked, one vmapped call.
+
+    A run that stands behind the others, after an interruption, first catches up on its own; then
+    the list holds its row alone.
+
+    Args:
+      runs: seeds of one configuration and task, with a budget in steps.
+
+    Raises:
+      ValueError: too many updates of a run were skipped; its state is saved first.
+    """
+    furthest = max(int(run.state.updates) for run in runs)
+    for run in runs:
+        for row in run.chunks(until=furthest):
+            yield [row]
+    if runs[0].progress >= 1.0:
+        return
+    config = runs[0].config
+    one = learner.make_train(config.learner, runs[0].model, config.chunk_updates)
+    several = jax.jit(jax.vmap(one, in_axes=(0, None, None, None)), donate_argnums=0)
+
+    @jax.jit  # one call for all arrays of all seeds
+    def apart(stacked: TrainState) -> list[TrainState]:
+        return [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(len(runs))]
+
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(run.state for run in runs))
+    arguments = runs[0]._words, runs[0]._params
+    journals = [run._journal() for run in runs]
+    chunk = several.lower(stacked, runs[0]._shares(), *arguments).compile()
+    while runs[0].progress < 1.0:
+        before, shares, began = runs[0].progress, runs[0]._shares(), time.perf_counter()
+        stacked, metrics = chunk(stacked, shares, *arguments)
+        metrics = jax.device_get(metrics)
+        took = time.perf_counter() - began
+        rows = []
+        for i, (run, state) in enumerate(zip(runs, apart(stacked), strict=True)):
+            own = {name: values[i] for name, values in metrics.items()}
+            rows.append(run._record(state, own, before, took, journals[i]))
+        yield rows
+        for run in runs:
+            run._check_finite()
+
+
+_UPDATE_MEANS = (
+    "policy_loss", "value_loss", "entropy", "explained_variance", "grad_norm", "learning_rate",
+)  # fmt: skip
+
+
+class Journal:
+    """`metrics.jsonl`. Where it cannot be written training goes on, and the rows wait in memory."""
+
+    def __init__(self, path: Path, updates: int) -> None:
+        """Rows behind `updates` belong to updates that will be done again: they are dropped."""
+        self.path = path
+        self._waiting: list[str] = []
+        self._size = 0  # bytes of whole rows
+        if path.exists():
+            kept = [row for row in read_metrics(path.parent) if row["updates"] <= updates]
+            text = "".join(json.dumps(row) + "\n" for row in kept)
+            files.write_text(path, text)
+            self._size = len(text)
+
+    def write(self, row: Row) -> None:
+        """Appends a row, and those that waited; warns once per time that it cannot."""
+        self._waiting.append(json.dumps(row, allow_nan=False) + "\n")
+        try:
+            with self.path.open("ab") as file:
+                file.truncate(min(self._size, file.tell()))  # what an earlier attempt left
+                file.write("".join(self._waiting).encode())
+            self._size = self.path.stat().st_size
+            self._waiting.clear()
+        except OSError as error:
+            if len(self._waiting) == 1:
+                reason = f"cannot be written ({error.strerror}); training goes on"
+                warnings.warn(f"{self.path}: {reason}, its rows wait in memory", stacklevel=2)
+
+
+def read_metrics(folder: Path) -> list[Row]:
+    """The rows of a run's `metrics.jsonl`; a line that was cut short or damaged is left out."""
+    rows = []
+    for line in (folder / METRICS_FILE).read_text(errors="replace").splitlines():
+        with contextlib.suppress(json.JSONDecodeError):
+            row = json.loads(line)
+            if isinstance(row, dict) and isinstance(row.get("updates"), int):
+                rows.append(row)
+    return rows

@@ -1,5 +1,0 @@
-"""Reading files that nobody vouches for: plain data or one line that says what is wrong."""
-
-from tdanet_jax.untrusted.errors import FileError
-
-__all__ = ["FileError"]

@@ -1,0 +1,342 @@
+"""A trained agent on its own: what it decides is what the network in the environment decides."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import tdanet_jax
+from tdanet_jax import config as configs
+from tdanet_jax.agent.agent import Agent, Detection
+from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.env import dynamics
+from tdanet_jax.env.reward import find_parents
+from tdanet_jax.models import actor_critic
+from tdanet_jax.models.classes import Classes, make_classes
+from tdanet_jax.sensors import triangulation
+from tdanet_jax.task import make_model
+from tdanet_jax.training import history
+from tdanet_jax.training.history import Snapshot
+from tdanet_jax.vocabulary import TARGETS, Action
+from tests.support import samples
+
+CONFIG = TrainConfig(network=NetworkConfig(width=16, hidden=16, precision="float32"))
+
+
+@pytest.fixture(scope="module")
+def weights(glove):
+    model = make_model(CONFIG, Classes())
+    return samples.parameters(model, glove.table(["Mug", "Bed"]))
+
+
+@pytest.fixture
+def agent(weights, glove):
+    return Agent(CONFIG, weights, glove)
+
+
+@pytest.fixture(scope="module")
+def sensing_agent(glove):
+    """An agent that senses its way, and goes by it; it mostly moves ahead."""
+    return going_by_odometry(glove, NetworkConfig(odometry=True))
+
+
+@pytest.fixture(scope="module")
+def sighting_agent(glove):
+    """One that senses where its target is, too."""
+    return going_by_odometry(glove, NetworkConfig(odometry=True, triangulation=True))
+
+
+@pytest.fixture(scope="module")
+def merging_agent(glove):
+    """One that senses its way, of a model that is shown one box for all objects of a class."""
+    network = NetworkConfig(odometry=True, rows="class")
+    return going_by_odometry(glove, network)
+
+
+def going_by_odometry(glove, network):
+    network = dataclasses.replace(network, width=16, hidden=16, precision="float32")
+    config = dataclasses.replace(CONFIG, network=network)
+    words = glove.table(["Mug", "Bed"])
+    weights = samples.going_by_odometry(make_model(config, Classes()), words)
+    if network.triangulation:  # nine of its inputs, and mostly zero
+        weights["way"]["kernel"] = weights["way"]["kernel"].at[-9:].multiply(5.0)
+    return Agent(config, weights, glove)
+
+
+def detections_of(tables, pose):
+    rows = slice(tables.row_start[pose], tables.row_start[pose + 1])
+    names = [tables.classes[c] for c in tables.row_class[rows]]
+    boxes = tables.row_box[rows] / (tables.image * tables.subpixel)
+    return [Detection(name, *map(float, box)) for name, box in zip(names, boxes, strict=True)]
+
+
+def decide_alike(agent, some_rooms, glove, merge, rotation=0, steps=3):
+    """The agent and its network in the environment, side by side; how often it was stopped."""
+    parents = find_parents(some_rooms, TARGETS)
+    params = dynamics.make_params(
+        some_rooms, TARGETS, parents, dynamics.TEST_STEP_LIMITS, merge=merge,
+        odometry=agent.model.odometry, triangulation=agent.model.triangulation,
+    )  # fmt: skip
+    model, weights = agent.model, agent.weights
+    table = actor_critic.prepare(model, weights, jnp.asarray(glove.table(some_rooms.classes)))
+    observe = jax.jit(jax.vmap(dynamics.observe, (0, None)))
+    transition = jax.jit(jax.vmap(dynamics.transition, (0, 0, None)))
+    forward = jax.jit(actor_critic.forward, static_argnums=0)
+    # It begins where it cannot move ahead.
+    ahead = some_rooms.next_position[:, rotation // 45]
+    position = int(np.flatnonzero(ahead == np.arange(len(ahead)))[9])
+    goal = some_rooms.targets.index("Mug")
+    one = jnp.array([position * 16 + rotation // 45 * 2]), jnp.array([goal])
+    state = jax.vmap(dynamics.start, (None, 0, 0))(params, *one)
+    carry, previous, fresh = model.initial_carry(1, weights), jnp.zeros((1, 6)), jnp.zeros(1, bool)
+    memory, blocked, stopped = agent.start(rotation), False, 0
+    for key in jax.random.split(jax.random.key(3), steps):
+        obs = observe(state, params)
+        carry, out = forward(model, weights, table, carry, obs, previous, fresh)
+        previous = jax.nn.softmax(out.logits)
+        seen, pose = detections_of(some_rooms, int(state.pose[0])), int(state.pose[0])
+        _, greedy = agent.act(memory, seen, "Mug", blocked=blocked)
+        assert greedy.action == Action(int(previous.argmax()))
+        memory, decision = agent.act(memory, seen, "Mug", key, blocked)
+        np.testing.assert_allclose(decision.probabilities, previous[0], rtol=1e-4)
+        np.testing.assert_allclose(decision.value, out.value[0], rtol=1e-4, atol=1e-6)
+        assert decision.action == int(jax.random.categorical(key, out.logits)[0])
+        state = transition(state, jnp.array([decision.action]), params).state
+        blocked = decision.action == Action.MOVE_AHEAD and int(state.pose[0]) == pose
+        stopped += blocked
+    return stopped
+
+
+@pytest.mark.parametrize("rotation", [0, 225])
+@pytest.mark.parametrize("who", ["agent", "sighting_agent", "merging_agent"])
+def test_it_decides_as_the_network_does_in_the_environment(
+    some_rooms, glove, who, rotation, request
+):
+    chosen = request.getfixturevalue(who)
+    steps = 25 if chosen.model.odometry else 3
+    merge = who == "merging_agent"
+    stopped = decide_alike(chosen, some_rooms, glove, merge, rotation, steps)
+    assert 0 < stopped < steps - 10 or who == "agent"
+
+
+def test_what_an_agent_senses_of_its_target_matters(sensing_agent, sighting_agent):
+    """It remembers where the target was, and not where others were."""
+    mug, sink = Detection("mug", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.1, 0.1, 0.3, 0.4)
+
+    def trail(agent, seen, target="mug"):
+        memory, _ = agent.act(agent.start(), [sink, seen], target)
+        return memory.trail
+
+    assert trail(sensing_agent, mug).sighting is None
+    known = trail(sighting_agent, mug).sighting
+    assert float(known.normal[0, 0]) > 0
+    assert not trail(sighting_agent, sink).sighting.normal.any()
+    memory, _ = sighting_agent.act(sighting_agent.start(), [mug, sink], "mug")
+    memory = memory._replace(action=jnp.int32(Action.MOVE_AHEAD))
+    unseen = memory._replace(trail=memory.trail.replace(sighting=triangulation.begin()))
+    moved, blocked, forgot = (
+        sighting_agent.act(start, [sink], "mug", blocked=stopped)[1].probabilities
+        for start, stopped in ((memory, False), (memory, True), (unseen, False))
+    )
+    assert np.abs(moved - forgot).max() > 1e-3
+    assert np.abs(moved - blocked).max() > 1e-3
+
+
+def test_of_another_target_an_agent_has_never_seen_anything(sighting_agent):
+    mug, sink = Detection("mug", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.6, 0.1, 0.8, 0.4)
+    memory, _ = sighting_agent.act(sighting_agent.start(), [mug, sink], "mug")
+    memory = memory._replace(action=jnp.int32(Action.MOVE_AHEAD))
+    assert memory.trail.sighting.normal.any()
+    never = memory._replace(trail=memory.trail.replace(sighting=triangulation.begin()))
+
+    def after(memory, seen, target):
+        return sighting_agent.act(memory, seen, target, blocked=False)
+
+    for seen, target in (([], "sink"), ([mug, sink], "sink"), ([mug], "toaster")):
+        (kept, one), (fresh, other) = (after(m, seen, target) for m in (memory, never))
+        np.testing.assert_array_equal(one.probabilities, other.probabilities)
+        assert one.value == other.value
+        for mine, theirs in zip(
+            jax.tree.leaves(kept.trail), jax.tree.leaves(fresh.trail), strict=True
+        ):
+            np.testing.assert_array_equal(mine, theirs)
+        # It remembers its way all the same, and nothing of the mug when it looks for that again.
+        assert tuple(kept.trail.cell) == (0, 1)
+        back, _ = after(kept._replace(action=jnp.int32(Action.LOOK_UP)), [], "mug")
+        assert not back.trail.sighting.normal.any()
+    # A new label on the way is no other target.
+    same, _ = after(memory, [Detection("vase", 0.6, 0.1, 0.8, 0.4)], "mug")
+    assert same.trail.sighting.normal.any()
+
+
+def test_what_an_agent_senses_of_its_way_matters(sensing_agent):
+    seen = [Detection("sink", 0.1, 0.1, 0.3, 0.4)]
+
+    def second(rotation=0, blocked=False, action=Action.MOVE_AHEAD):
+        memory, _ = sensing_agent.act(sensing_agent.start(rotation), seen, "mug")
+        memory = memory._replace(action=jnp.int32(action))
+        return sensing_agent.act(memory, seen, "mug", blocked=blocked)[1].probabilities
+
+    plain = second()
+    for other in (
+        second(rotation=45),
+        second(blocked=True),
+        second(action=Action.ROTATE_LEFT),
+    ):
+        assert np.abs(other - plain).max() > 1e-3
+    np.testing.assert_array_equal(second(rotation=-270), plain)
+    np.testing.assert_array_equal(second(rotation=315), second(rotation=45))
+    # Only a MoveAhead can be blocked.
+    turned = second(action=Action.ROTATE_LEFT, blocked=True)
+    np.testing.assert_array_equal(turned, second(action=Action.ROTATE_LEFT))
+
+
+def test_an_agent_that_senses_nothing_of_its_way_needs_not_be_told(agent):
+    seen = [Detection("sink", 0.1, 0.1, 0.3, 0.4)]
+    assert agent.start(45).trail is None
+    memory, plain = agent.act(agent.start(45), seen, "mug", blocked=True)
+    np.testing.assert_array_equal(
+        plain.probabilities, agent.act(agent.start(), seen, "mug")[1].probabilities
+    )
+    assert memory.trail is None
+
+
+def test_an_agent_that_senses_its_way_must_be_told_whether_its_move_was_blocked(sensing_agent):
+    seen = [Detection("sink", 0.1, 0.1, 0.3, 0.4)]
+    memory, _ = sensing_agent.act(sensing_agent.start(), seen, "mug")
+    moved = memory._replace(action=jnp.int32(Action.MOVE_AHEAD))
+    with pytest.raises(ValueError, match="whether its MoveAhead was `blocked`"):
+        sensing_agent.act(moved, seen, "mug")
+    turned = memory._replace(action=jnp.int32(Action.ROTATE_LEFT))
+    sensing_agent.act(turned, seen, "mug")
+
+
+def test_a_start_that_looks_down_is_sensed(sensing_agent):
+    assert int(sensing_agent.start(horizon=30).trail.horizon) == 1
+    assert int(sensing_agent.start(45.0001, 0.0).trail.heading) == 1
+    with pytest.raises(ValueError, match="horizon 15: neither 0 nor 30"):
+        sensing_agent.start(horizon=15)
+
+
+@pytest.mark.parametrize("rotation", [30, -1, 44.5])
+def test_a_rotation_off_the_eight_is_refused(agent, sensing_agent, rotation):
+    for one in (agent, sensing_agent):
+        with pytest.raises(ValueError, match=f"rotation {rotation}: not a multiple of 45"):
+            one.start(rotation)
+
+
+@pytest.fixture(scope="module")
+def row_agent(some_rooms, glove):
+    """An agent with a row per known class, and parameters that make every row matter."""
+    classes = make_classes(some_rooms.classes, {"Toaster", "Laptop", "Bread"})
+    config = dataclasses.replace(CONFIG, model="ssnet")
+    model = make_model(config, classes)
+    words = jnp.asarray(glove.table(some_rooms.classes))
+    weights = samples.parameters(model, words)
+    return Agent(config, weights, glove, classes)
+
+
+def test_a_model_with_a_row_per_class_is_shown_what_it_was_in_training(
+    row_agent, some_rooms, glove
+):
+    decide_alike(row_agent, some_rooms, glove, merge=True)
+
+
+def test_a_model_with_a_row_per_class_sees_known_classes_alone_and_any_target(row_agent):
+    sink, mug = Detection("sink", 0.1, 0.1, 0.3, 0.4), Detection("mug", 0.5, 0.5, 0.6, 0.7)
+    others = [Detection(name, 0.0, 0.0, 1.0, 1.0) for name in ("toaster", "dog", "bread")]
+
+    def probabilities(seen, target):
+        return row_agent.act(row_agent.start(), seen, target)[1].probabilities
+
+    plain = probabilities([sink, mug], "toaster")
+    np.testing.assert_allclose(probabilities([mug, *others, sink], "toaster"), plain, rtol=1e-5)
+    assert np.abs(probabilities([sink], "toaster") - plain).max() > 1e-4
+    assert np.abs(probabilities([sink, mug], "dog") - plain).max() > 1e-4
+    assert row_agent.act(row_agent.start(), [sink], "mug")[1].attention is None
+
+
+def test_a_model_that_sees_an_image_can_be_looked_into_but_not_asked(some_rooms, glove):
+    classes = make_classes(some_rooms.classes, {"Toaster"})
+    network = dataclasses.replace(CONFIG.network, image="raster")
+    config = dataclasses.replace(CONFIG, model="baseline", network=network)
+    words = glove.table(some_rooms.classes)
+    agent = Agent(config, samples.parameters(make_model(config, classes), words), glove, classes)
+    assert agent.weights["actor"]["kernel"].shape == (16, 6)
+    with pytest.raises(ValueError, match="baseline looks at an image; an agent is shown det"):
+        agent.act(agent.start(), [Detection("sink", 0.1, 0.1, 0.3, 0.4)], "mug")
+
+
+def test_attention_sums_to_one_over_the_detections_and_none_is_fine(agent):
+    seen = [Detection("coffee machine", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.5, 0.5, 1, 1)]
+    memory, decision = agent.act(agent.start(), seen, "toaster")
+    assert decision.attention.shape == (2,)
+    assert decision.attention.sum() == pytest.approx(1, abs=1e-5)
+    _, blank = agent.act(memory, [], "toaster")
+    assert blank.attention.shape == (0,)
+    assert np.isfinite(blank.probabilities).all()
+
+
+def test_order_and_new_labels_change_nothing(agent):
+    seen = [Detection(name, 0.1, 0.1, 0.3, 0.4) for name in ("sink", "mug", "plate")]
+    _, first = agent.act(agent.start(), seen, "mug")
+    agent.act(agent.start(), [Detection("dog", 0, 0, 1, 1)], "horse")
+    _, second = agent.act(agent.start(), seen[::-1], "mug")
+    np.testing.assert_allclose(first.probabilities, second.probabilities, rtol=1e-5)
+    np.testing.assert_allclose(first.attention, second.attention[::-1], rtol=1e-5)
+
+
+def test_a_key_samples_and_the_same_key_samples_the_same(agent):
+    seen = [Detection("mug", 0.1, 0.1, 0.3, 0.4)]
+    keys = jax.random.split(jax.random.key(0), 20)
+    actions = [agent.act(agent.start(), seen, "mug", key)[1].action for key in keys]
+    again = [agent.act(agent.start(), seen, "mug", key)[1].action for key in keys]
+    assert actions == again
+    assert len(set(actions)) > 1
+
+
+def test_bad_input_is_refused(agent, tmp_path):
+    with pytest.raises(KeyError, match="qwertzu"):
+        agent.act(agent.start(), [], "qwertzu")
+    with pytest.raises(ValueError, match="corners must be shares"):
+        Detection("mug", 120, 80, 160, 130)
+    with pytest.raises(ValueError, match="is this the folder of a run"):
+        tdanet_jax.load(tmp_path)
+
+
+#: A run of the first version of the software, width 4, and its second decision about two objects.
+OLD_RUN = Path(__file__).parents[1] / "data" / "run_format_1"
+
+
+def test_a_run_of_the_first_version_still_decides_as_it_did(tmp_path):
+    run = shutil.copytree(OLD_RUN, tmp_path / "run")
+    old = tdanet_jax.load(run)
+    seen = [Detection("sink", 0.1, 0.2, 0.4, 0.5), Detection("coffee machine", 0.5, 0.5, 0.75, 1.0)]
+    memory = old.start()
+    for _ in range(2):
+        memory, decision = old.act(memory, seen, "toaster")
+    expected = json.loads((run / "second_decision.json").read_text())
+    np.testing.assert_allclose(decision.probabilities, expected["probabilities"], atol=1e-6)
+    np.testing.assert_allclose(decision.value, expected["value"], atol=1e-6)
+    np.testing.assert_allclose(decision.attention, expected["attention"], atol=1e-5)
+
+
+def test_a_checkpoint_of_a_newer_version_is_refused_in_one_line(tmp_path):
+    run = shutil.copytree(OLD_RUN, tmp_path / "run")
+    meta = run / "checkpoints" / "2" / "meta" / "metadata"
+    meta.write_text(meta.read_text().replace('"format": 1', '"format": 2'))
+    with pytest.raises(ValueError, match="checkpoint of format 2, this version reads up to 1"):
+        tdanet_jax.load(run)
+
+
+def test_a_point_of_the_history_is_loaded_by_its_file(weights, glove, tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps(configs.to_json(CONFIG)))
+    path = history.write(tmp_path, Snapshot(weights, 40, 3, 1.0, 1, "any"))
+    loaded = tdanet_jax.load(path)
+    for ours, theirs in zip(jax.tree.leaves(loaded.weights), jax.tree.leaves(weights), strict=True):
+        np.testing.assert_array_equal(ours, theirs)

@@ -1,0 +1,42 @@
+"""The notebook runs from its first cell to its last, on any run."""
+
+import os
+import re
+from pathlib import Path
+
+import nbclient
+import nbformat
+import pytest
+
+NOTEBOOK = Path(__file__).parents[2] / "notebooks" / "analysis.ipynb"
+
+
+@pytest.fixture
+def notebook():
+    return nbformat.read(NOTEBOOK, as_version=4)
+
+
+def test_it_runs(notebook, opinionated_run, tmp_path, monkeypatch):
+    first = next(cell for cell in notebook.cells if cell.cell_type == "code")
+    (name,) = re.findall(r'^RUN = "(.*)"', first.source, re.MULTILINE)
+    assert (NOTEBOOK.parent / name / "config.json").exists()
+    first.source = first.source.replace(name, str(opinionated_run))
+    monkeypatch.setenv("PYTHONPATH", os.getcwd())
+    nbclient.NotebookClient(
+        notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}
+    ).execute()
+    outputs = [out for cell in notebook.cells for out in cell.get("outputs", ())]
+    assert sum("image/png" in out.get("data", ()) for out in outputs) == 3
+    assert not [out for out in outputs if out.get("name") == "stderr"]
+    loaded = outputs[0]["text"]
+    assert loaded.startswith("tdanet split 18/4")
+
+
+def test_it_is_committed_with_the_outputs_of_a_run_and_without_anybodys_paths(notebook):
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
+    assert all(out.output_type != "error" for cell in code for out in cell.outputs)
+    text = NOTEBOOK.read_text()
+    assert len(text) < 400_000
+    assert "/home/" not in text
+    assert "/tmp/" not in text

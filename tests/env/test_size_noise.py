@@ -1,0 +1,111 @@
+"""Targets that look larger or smaller than they are, another factor in each training episode."""
+
+from __future__ import annotations
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.env import dynamics
+from tdanet_jax.env.dynamics import EnvParams, EnvState, Observation
+from tdanet_jax.env.reward import no_parents
+from tdanet_jax.scenes import SceneTables
+from tdanet_jax.scenes.dataset import Rooms
+from tdanet_jax.task import make_task
+from tdanet_jax.words import WordVectors
+from tests.support.oracle import ROOMS
+
+BATCH, STEPS, NOISE = 128, 40, 0.5
+
+
+def params_of(tables: SceneTables, noise: float, senses: bool = False) -> EnvParams:
+    targets = dict.fromkeys(ROOMS, tables.targets)
+    more = {"odometry": senses, "triangulation": senses, "size_noise": noise}
+    return dynamics.make_params(tables, targets, no_parents(tables), (7,) * 4, merge=False, **more)
+
+
+@jax.jit
+def played(params: EnvParams) -> tuple[EnvState, Observation]:
+    """States and observations [STEPS, BATCH] of random actions, with automatic resets."""
+
+    def one(carry: tuple, key: jax.Array) -> tuple:
+        obs, state = carry
+        action = jax.random.randint(key, (BATCH,), 0, 5)
+        keys = jax.random.split(key, BATCH)
+        after = jax.vmap(dynamics.step, (0, 0, 0, None))(keys, state, action, params)[:2]
+        return after, (state, obs)
+
+    keys = jax.random.split(jax.random.key(1), BATCH)
+    begun = jax.vmap(dynamics.reset, (0, None))(keys, params)
+    return jax.lax.scan(one, begun, jax.random.split(jax.random.key(2), STEPS))[1]
+
+
+@pytest.fixture(scope="module")
+def pairs(some_rooms: SceneTables) -> tuple:
+    """The same episodes without and with noise."""
+    return played(params_of(some_rooms, 0.0)), played(params_of(some_rooms, NOISE))
+
+
+def test_the_targets_boxes_alone_grow_and_by_one_factor_an_episode(pairs: tuple) -> None:
+    (plain, truth), (state, obs) = pairs
+    np.testing.assert_array_equal(state.pose, plain.pose)
+    chex.assert_trees_all_equal(obs.replace(boxes=truth.boxes), truth)
+    is_target = truth.mask & (truth.classes == truth.target[..., None])
+    assert is_target.any(-1).sum() > 200
+    factor = np.where(is_target, state.area_factor[..., None], 1)
+    expected = np.minimum(np.asarray(truth.boxes[..., 2]) * factor, 1)
+    np.testing.assert_allclose(obs.boxes[..., 2], expected, rtol=1e-6)
+    np.testing.assert_array_equal(obs.boxes[..., :2], truth.boxes[..., :2])
+
+
+def test_a_factor_lasts_for_an_episode_and_is_spread_over_its_range(pairs: tuple) -> None:
+    state = pairs[1][0]
+    size, steps = np.asarray(state.area_factor), np.asarray(state.steps)
+    goes_on = steps[1:] > 0
+    np.testing.assert_array_equal((size[1:] == size[:-1]), goes_on)
+    sides = np.log(size[steps == 0]) / 2
+    assert np.abs(sides).max() <= NOISE
+    low, high = np.quantile(sides, [0.1, 0.9])
+    np.testing.assert_allclose([low, high], [-0.8 * NOISE, 0.8 * NOISE], atol=0.05)
+
+
+def test_what_is_sensed_of_the_target_is_that_of_its_changed_boxes(some_rooms: SceneTables) -> None:
+    (_, truth), (state, obs) = (
+        played(params_of(some_rooms, noise, True)) for noise in (0.0, NOISE)
+    )
+    assert truth.odometry is not None
+    assert obs.odometry is not None
+    there, seen = np.asarray(truth.odometry.target), np.asarray(obs.odometry.target)
+    place, radius = slice(0, 3), 3
+    np.testing.assert_array_equal(seen[..., place], there[..., place])
+    whole = (there[..., radius] < 0.6) & (seen[..., radius] < 0.6) & (there[..., radius] > 0)
+    ratio = seen[..., radius][whole] / there[..., radius][whole]
+    np.testing.assert_allclose(ratio, np.sqrt(np.asarray(state.area_factor))[whole], rtol=1e-4)
+
+
+def test_no_box_exceeds_the_image(some_rooms: SceneTables) -> None:
+    params = params_of(some_rooms, NOISE)
+    row = int(np.flatnonzero(some_rooms.row_class == int(params.target_class[0]))[0])
+    pose = jnp.int32(some_rooms.row_state[row])
+    huge = dynamics.start(params, pose, jnp.int32(0), jnp.float32(1e9))
+    obs = jax.jit(dynamics.observe)(huge, params)
+    of_target = np.asarray(obs.boxes[:, 2])[np.asarray(obs.mask & (obs.classes == obs.target))]
+    assert of_target.size
+    assert (of_target == 1).all()
+
+
+def test_without_noise_nothing_is_drawn(some_rooms: SceneTables) -> None:
+    assert dynamics.reset_state(jax.random.key(0), params_of(some_rooms, 0.0)).area_factor is None
+    start = jax.jit(dynamics.start)(params_of(some_rooms, NOISE), jnp.int32(0), jnp.int32(0))
+    assert start.area_factor is None  # a given episode is as it is
+
+
+def test_training_alone_is_noisy(ithor: Rooms, glove: WordVectors) -> None:
+    config = TrainConfig(
+        learner=LearnerConfig(size_noise=NOISE), network=NetworkConfig(width=8, hidden=8)
+    )
+    task = make_task(config, ithor, glove)
+    assert (task.train_params.size_noise, task.eval_params.size_noise) == (NOISE, 0.0)

@@ -1,0 +1,134 @@
+"""The shape of results.json, the records beside it, and the page."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from tdanet_jax.evaluation import report
+from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.evaluation.rollout import Records
+from tdanet_jax.vocabulary import ALL_TARGETS
+
+BUCKET = {"SR", "SPL", "SR_ci", "SPL_ci", "n"}
+TOP = [
+    "version", "split", "model", "policy", "episodes_trained", "seen", "unseen", "by_room",
+    "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "odometry",
+    "triangulation", "commit",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def played(ithor):
+    """Three episodes a group, from real rooms: one success in four actions, two failures."""
+    goal = ALL_TARGETS.index("Mug")
+    reach = np.flatnonzero((ithor.distance[:, goal] == 3) & (ithor.state_scene < 30))
+    episodes = Episodes(reach[:3].astype(np.int32), np.full(3, goal, np.int32))
+    actions = np.full((3, 200), -1, np.int8)
+    actions[:, :4] = [[0, 1, 2, 5], [0, 0, 0, 5], [3, 4, 1, 5]]
+    actions[0, 4:8] = -1
+    records = Records(
+        shortest=np.array([4, 4, 4]),
+        length=np.array([4, 4, 4]),
+        success=np.array([True, False, False]),
+        actions=actions,
+    )
+    return {"seen": (episodes, records)}
+
+
+@pytest.fixture
+def written(played, ithor, tmp_path):
+    provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 7, 200, ithor.data_version)
+    return tmp_path, report.write(tmp_path, provenance, ithor, played)
+
+
+def test_results_have_the_documented_shape(written):
+    folder, out = written
+    assert json.loads((folder / "results.json").read_text()) == out
+    assert list(out) == TOP
+    assert out["unseen"] is None
+    assert set(out["seen"]) == {"L>=1", "L>=5"}
+    assert set(out["seen"]["L>=1"]) == BUCKET
+    assert out["by_room"] == {"kitchen": {"seen": out["seen"]}}
+    assert out["by_target"] == {"Mug": {"seen": out["seen"]}}
+
+
+def test_the_report_says_how_it_can_be_made_again(played, ithor, tmp_path):
+    shown = report.Provenance(
+        "18/4", "savn", "sample", 1, 0, 7, 2, ithor.data_version, "rooms.npz", "a map"
+    )
+    out = report.write(tmp_path, shown, ithor, played)
+    names = ("seed", "evaluation_seed", "data", "image")
+    assert [out[name] for name in names] == [0, 7, "rooms.npz", "a map"]
+    page = (tmp_path / "results.md").read_text()
+    assert "sample actions, evaluation seed 7;" in page
+    assert "\nData: rooms.npz.\nImage: a map.\n" in page
+
+
+def test_the_report_says_that_an_agent_senses_more_than_the_papers(played, ithor, tmp_path):
+    shown = report.Provenance(
+        "18/4", "tdanet", "sample", 1, 0, 7, 2, ithor.data_version, odometry=True
+    )
+    for sights, name in (
+        (False, "tdanet, --odometry"),
+        (True, "tdanet, --odometry, --triangulation"),
+    ):
+        shown = dataclasses.replace(shown, triangulation=sights)
+        out = report.write(tmp_path, shown, ithor, played)
+        assert (out["odometry"], out["triangulation"]) == (True, sights)
+        page = (tmp_path / "results.md").read_text()
+        assert page.startswith(f"# {name}, split 18/4")
+        assert f"| **{name} (ours)** |" in page
+        assert report.agent_name("tdanet", True, sights) == name
+    assert report.agent_name("tdanet", False, False) == "tdanet"
+
+
+def test_a_folder_that_is_not_there_is_made(played, ithor, tmp_path):
+    shown = report.Provenance("18/4", "tdanet", "sample", 10, 3, 7, 200, ithor.data_version)
+    report.write(tmp_path / "one" / "two", shown, ithor, played)
+    assert sorted(path.name for path in (tmp_path / "one" / "two").iterdir()) == [
+        "episodes.jsonl", "results.json", "results.md"
+    ]  # fmt: skip
+
+
+def test_percentages_run_from_0_to_100_and_an_empty_bucket_is_null(written):
+    _, out = written
+    assert out["seen"]["L>=1"]["SR"] == pytest.approx(100 / 3, abs=0.01)
+    assert out["seen"]["L>=1"]["SPL"] == pytest.approx(100 / 3, abs=0.01)
+    assert out["seen"]["L>=5"] == {"SR": None, "SPL": None, "SR_ci": None, "SPL_ci": None, "n": 0}
+
+
+def test_one_record_per_episode(written, played, ithor):
+    folder, _ = written
+    rows = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    assert len(rows) == 3
+    first = rows[0]
+    assert first["actions"] == ["MoveAhead", "RotateLeft", "RotateRight", "Done"]
+    assert (first["L"], first["e"], first["success"], first["target"]) == (4, 4, True, "Mug")
+    pose = played["seen"][0].pose[0]
+    assert first["scene"] == ithor.scenes[ithor.state_scene[pose]]
+    assert first["rotation"] == 45 * (pose // 2 % 8)
+
+
+def test_the_page_shows_the_paper_beside_ours_and_says_that_the_worlds_differ(written):
+    page = (written[0] / "results.md").read_text()
+    assert "TDANet (paper) | 74.7 | 29.7" in page
+    assert "The worlds differ" in page
+    assert "33.3" in page
+
+
+def test_unseen_classes_with_a_near_synonym_are_reported_apart(ithor, tmp_path):
+    goals = [ALL_TARGETS.index(name) for name in ("ToiletPaper", "Laptop")]
+    poses = [np.flatnonzero(ithor.distance[:, goal] == 2)[0] for goal in goals]
+    episodes = Episodes(np.array(poses, np.int32), np.array(goals, np.int32))
+    actions = np.full((2, 200), -1, np.int8)
+    actions[:, :3] = [0, 0, 5]
+    records = Records(np.array([3, 3]), np.array([3, 3]), np.array([True, False]), actions)
+    provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 7, 200, ithor.data_version)
+    played = {"seen": (episodes, records), "unseen": (episodes, records)}
+    report.write(tmp_path, provenance, ithor, played)
+    page = (tmp_path / "results.md").read_text()
+    assert "| unseen | ToiletPaper | 100.0 (100.0 to 100.0) |" in page
+    assert "| unseen | without ToiletPaper | 0.0 (0.0 to 0.0) |" in page
+    assert "known in training (ToiletPaper: ToiletPaperHanger, PaperTowelRoll) apart" in page

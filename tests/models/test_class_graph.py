@@ -1,0 +1,105 @@
+"""The class graph: its rule by hand, against a slow form in the real rooms, and its normal form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tdanet_jax.config import TrainConfig
+from tdanet_jax.models import class_graph
+from tdanet_jax.models.classes import Classes
+from tdanet_jax.scenes import SceneTables
+from tdanet_jax.scenes.dataset import Extras
+from tdanet_jax.task import make_task
+from tdanet_jax.words import WordVectors
+from tests.support.handmade import Room, corridor, tables_of
+
+CLASSES = ("Apple", "Bed", "Mug", "Sink", "Sofa")
+
+
+def tables(*rooms: dict[str, float | tuple[float, ...]]) -> SceneTables:
+    """Rooms whose objects stand on a line, at the given metres."""
+    made = []
+    for places in rooms:
+        objects = [
+            (name, (x, 0.0, 0.0))
+            for name, where in places.items()
+            for x in (where if isinstance(where, tuple) else (where,))
+        ]
+        made.append(Room("kitchen", corridor(1), objects, {}))
+    return tables_of(made, CLASSES, ["Mug"])
+
+
+def joined(found: np.ndarray) -> set[tuple[str, str]]:
+    return {(CLASSES[i], CLASSES[j]) for i, j in np.argwhere(found) if i < j}
+
+
+def test_two_classes_are_joined_if_half_of_two_rooms_show_them_near() -> None:
+    found = class_graph.co_occurrence(
+        tables(
+            {"Apple": 0.0, "Mug": (9.0, 1.5), "Sink": 0.5, "Sofa": 0.1},
+            {"Apple": 0.0, "Mug": 1.51, "Sink": 5.0},
+            {"Apple": 0.0, "Sink": 5.0},
+        )
+    )
+    # Apple and Sink are near in one of three rooms, Sofa shares one room alone with the others.
+    # Mug and Sink: 1.0 m in the first room, 3.49 in the second.
+    assert joined(found) == {("Apple", "Mug"), ("Mug", "Sink")}
+    np.testing.assert_array_equal(found, found.T)
+    assert found.dtype == np.float32
+
+
+def test_the_training_rooms_graph_is_the_one_of_a_slow_form(
+    some_rooms: SceneTables, glove: WordVectors
+) -> None:
+    centres = (some_rooms.object_box[:, :3] + some_rooms.object_box[:, 3:]) / 2
+    found = class_graph.co_occurrence(some_rooms)
+    by_room: list[dict[int, list[np.ndarray]]] = [{} for _ in some_rooms.scenes]
+    for scene, cls, centre in zip(
+        some_rooms.object_scene, some_rooms.object_class, centres, strict=True
+    ):
+        by_room[scene].setdefault(int(cls), []).append(centre)
+    for i in range(len(some_rooms.classes)):
+        for j in range(i):
+            gaps = [
+                min(float(np.linalg.norm(a - b)) for a in room[i] for b in room[j])
+                for room in by_room
+                if i in room and j in room
+            ]
+            near = sum(gap <= 1.5 for gap in gaps)
+            assert found[i, j] == (len(gaps) >= 2 and near >= len(gaps) / 2)
+
+
+def test_the_normal_form_is_symmetric_with_self_loops() -> None:
+    classes = Classes(CLASSES, (0, 2, 3), ((0, 2, 1.0), (2, 3, 0.5)))
+    found = class_graph.normalised(classes)
+    degree = np.array([2.0, 2.5, 1.5])
+    expected = np.array([[1, 1, 0], [1, 1, 0.5], [0, 0.5, 1]]) / np.sqrt(np.outer(degree, degree))
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_without_edges_every_class_is_its_own() -> None:
+    np.testing.assert_array_equal(class_graph.normalised(Classes(CLASSES, (1, 4))), np.eye(2))
+
+
+def test_a_graph_from_elsewhere_takes_the_place_of_the_rooms_own(
+    ithor: SceneTables, glove: WordVectors
+) -> None:
+    names = ithor.classes
+    mug, sink, toaster = (names.index(name) for name in ("Mug", "Sink", "Toaster"))
+    adjacency = np.zeros((len(names), len(names)), np.float32)
+    adjacency[mug, sink] = adjacency[mug, toaster] = 1.0
+    task = make_task(
+        TrainConfig(split="18/4"), ithor, glove, Extras(graph_classes=names, adjacency=adjacency)
+    )
+    assert task.classes.edges == ((mug, sink, 1.0),)  # Toaster is unseen
+    own = make_task(TrainConfig(split="18/4"), ithor, glove).classes
+    assert 400 < len(own.edges) < 900
+    assert {i for edge in own.edges for i in edge[:2]} <= set(own.known)
+
+
+@pytest.mark.parametrize("split", ["22/0", "14/8"])
+def test_no_unseen_class_is_a_node(ithor: SceneTables, glove: WordVectors, split: str) -> None:
+    classes = make_task(TrainConfig(split=split), ithor, glove).classes
+    assert class_graph.normalised(classes).shape == (len(classes.known),) * 2
+    assert len(ithor.classes) - len(classes.known) == int(split.partition("/")[2])

@@ -1,0 +1,233 @@
+"""What the camera sees: by hand, against dense ray casting, and under symmetries."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tdanet_jax.scenes import ithor
+from tdanet_jax.scenes.checks import agreement
+from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.scenes.visibility.build import look_around
+from tdanet_jax.scenes.visibility.rules import RULES, Rules
+from tdanet_jax.scenes.visibility.solids import fronts_of, patches_of, solids_of, void_boxes
+from tests.support import toy
+
+BARE = dataclasses.replace(RULES, void=100.0)  # toy rooms have no walls
+MIDDLE = 2400  # of the image, in sixteenths of a pixel
+
+
+def seen(
+    scene: Scene, position: int, heading: int, horizon: int = 0, rules: Rules = BARE
+) -> dict[str, tuple[np.ndarray, bool]]:
+    """Box and visibility of each object seen from a state, by class."""
+    sight = look_around(scene, rules)
+    rows = np.flatnonzero(sight.state == (position * 8 + heading) * 2 + horizon)
+    return {
+        scene.objects[sight.owner[r]].object_class: (sight.box[r], bool(sight.visible[r]))
+        for r in rows
+    }
+
+
+def test_corridor_by_hand() -> None:
+    scene = toy.corridor()
+    for position, depth in enumerate((2.15, 1.9, 1.65, 1.4, 1.15)):
+        box, visible = seen(scene, position, 0)["Apple"]
+        half = MIDDLE * 0.1 / depth  # the near face is 0.2 m wide
+        expected = [MIDDLE - half, MIDDLE - half, MIDDLE + half, MIDDLE + half]
+        assert np.allclose(box, expected, atol=4), position
+        assert visible == (depth < RULES.reach)
+
+
+@pytest.mark.parametrize("heading", range(8))
+def test_headings_turn_clockwise_from_z(heading: int) -> None:
+    angle = np.radians(45 * heading)
+    apple = toy.thing("Apple", (np.sin(angle), toy.CAMERA, np.cos(angle)))
+    scene = toy.room(toy.line(1), apple)
+    for other in range(8):
+        found = seen(scene, 0, other)
+        if other == heading:
+            box, visible = found["Apple"]
+            assert visible
+            assert abs((box[0] + box[2]) / 2 - MIDDLE) < 8
+        elif (other - heading) % 8 in (2, 3, 4, 5, 6):
+            assert not found
+    right = seen(toy.room(toy.line(1), apple), 0, (heading - 1) % 8)
+    if right:  # half a quarter turn to the left puts it at the right edge
+        assert (right["Apple"][0][0] + right["Apple"][0][2]) / 2 > 2 * MIDDLE * 0.9
+
+
+def test_looking_down_moves_the_picture_up() -> None:
+    # At a depression of 30 degrees, straight ahead: in the middle of the lowered view.
+    depth = 1.0
+    apple = toy.thing("Apple", (0.0, toy.CAMERA - depth * np.tan(np.pi / 6), depth), (0.1,) * 3)
+    scene = toy.room(toy.line(1), apple)
+    low, high = seen(scene, 0, 0, 1)["Apple"][0], seen(scene, 0, 0, 0)["Apple"][0]
+    assert abs((low[1] + low[3]) / 2 - MIDDLE) < 0.05 * MIDDLE
+    assert abs((high[1] + high[3]) / 2 - MIDDLE * (1 + np.tan(np.pi / 6))) < 0.06 * MIDDLE
+
+
+def test_boxes_are_cut_at_the_image() -> None:
+    sofa = toy.thing("Sofa", (1.0, toy.CAMERA, 1.5), (2.0, 0.4, 0.4))
+    box, _ = seen(toy.room(toy.line(1), sofa), 0, 0)["Sofa"]
+    # A patch whose middle is outside does not count: the box may end half a patch before the edge.
+    assert 2 * MIDDLE * (1 - RULES.patch / 2) < box[2] <= 2 * MIDDLE
+    assert box[0] == pytest.approx(MIDDLE, abs=4)
+
+
+def wall(kind: str, z: float, **shape: float) -> SceneObject:
+    return toy.thing(kind, (0.0, toy.CAMERA, z), (2.0, shape.get("height", 2.0), 0.2))
+
+
+def test_what_hides_and_what_does_not() -> None:
+    apple = toy.thing("Apple", (0.0, toy.CAMERA, 1.2))
+    for kind, hides in (("Sofa", True), ("Fridge", True), ("Curtains", False), ("Chair", False)):
+        found = seen(toy.room(toy.line(1), apple, wall(kind, 0.6)), 0, 0)
+        assert ("Apple" in found) != hides, kind
+        assert kind in found
+
+
+def test_a_table_hides_by_its_top_alone() -> None:
+    low = toy.thing("Apple", (0.0, 0.3, 1.45))
+    table = toy.thing("DiningTable", (0.0, 0.4, 1.1), (2.0, 0.8, 0.3))
+    sofa = toy.thing("Sofa", (0.0, 0.4, 1.1), (2.0, 0.8, 0.3))
+    assert "Apple" in seen(toy.room(toy.line(1), low, table), 0, 0, 1)
+    assert "Apple" not in seen(toy.room(toy.line(1), low, sofa), 0, 0, 1)
+
+
+@pytest.mark.parametrize(("is_open", "found"), [(True, True), (False, False)])
+def test_only_closed_things_hide_what_they_hold(is_open: bool, found: bool) -> None:
+    fridge = toy.thing("Fridge", (0.0, toy.CAMERA, 1.2), (0.8,) * 3, is_open=is_open)
+    apple = toy.thing("Apple", (0.0, toy.CAMERA, 1.2))
+    assert ("Apple" in seen(toy.room(toy.line(1), fridge, apple), 0, 0)) == found
+
+
+def test_reach_is_horizontal() -> None:
+    for distance, within in ((RULES.reach - 0.01, True), (RULES.reach + 0.01, False)):
+        lamp = toy.thing("Painting", (0.0, toy.CAMERA + 0.8, distance + 0.1))
+        assert seen(toy.room(toy.line(1), lamp), 0, 0)["Painting"][1] == within
+
+
+def test_fronts_look_at_the_room() -> None:
+    drawer = toy.thing("Drawer", (0.0, 0.5, 1.5), (0.4, 0.2, 0.4))
+    assert fronts_of(drawer, toy.line(3), RULES.nearly) == [(2, 0)]
+    aside = toy.points((1.5, 1.5), (1.75, 1.5))
+    assert fronts_of(drawer, aside, RULES.nearly) == [(0, 1)]
+    # From behind, nothing of the drawer is seen; of a sofa in its place much is.
+    spots = toy.points((0.0, 0.0), (0.0, 0.25), (0.0, 3.5))
+    assert "Drawer" in seen(toy.room(spots, drawer), 0, 0)
+    assert "Drawer" not in seen(toy.room(spots, drawer), 2, 4)
+    sofa = dataclasses.replace(drawer, object_class="Sofa", object_id="Sofa|0")
+    assert "Sofa" in seen(toy.room(spots, sofa), 2, 4)
+
+
+def test_counters_end_where_one_can_stand() -> None:
+    counter = toy.thing("CounterTop", (0.0, 0.9, 1.0), (3.0, 0.04, 3.0))
+    scene = toy.room(toy.line(3), counter)
+    patches = patches_of(scene, RULES)
+    gaps = np.abs(patches.center[:, None] / 1000 - scene.points)[:, :, [0, 2]]
+    assert np.hypot(*np.moveaxis(gaps, -1, 0)).min() >= RULES.standing
+    assert len(patches.owner) > 100
+
+
+def test_nothing_is_seen_through_a_void() -> None:
+    # Two arms of an L: from the end of one the far thing in the other is behind the corner.
+    spots = [(0.0, 0.25 * i) for i in range(17)] + [(0.25 * i, 4.0) for i in range(1, 17)]
+    apple = toy.thing("Apple", (4.0, toy.CAMERA, 4.5))
+    scene = toy.room(toy.points(*spots), apple)
+    assert void_boxes(scene, RULES)
+    assert "Apple" not in seen(scene, 0, 1, rules=RULES)  # from (0, 0) across the corner
+    assert "Apple" in seen(scene, 16, 2, rules=RULES)  # from (0, 4) along the arm
+    assert "Apple" in seen(scene, 0, 1)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20)
+def test_voids_keep_clear_of_points_and_objects(seed: int) -> None:
+    scene = toy.random_room(np.random.default_rng(seed))
+    rules = dataclasses.replace(RULES, void=0.3)
+    for box in void_boxes(scene, rules):
+        low, high = box[0, [0, 2]] - 0.1, box[1, [0, 2]] + 0.1
+        ground = scene.points[:, [0, 2]]
+        assert not ((ground > low) & (ground < high)).all(axis=1).any()
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=10)
+def test_turning_the_room_turns_the_views(seed: int) -> None:
+    scene = toy.random_room(np.random.default_rng(seed))
+    turned = quarter_turn(scene)
+    a, b = look_around(scene, BARE), look_around(turned, BARE)
+    position, view = np.divmod(a.state, 16)
+    moved = position * 16 + (view + 4) % 16  # two headings of 45 degrees, two horizons each
+    order = np.lexsort((a.owner, moved))
+    assert (moved[order] == b.state).all()
+    assert (a.owner[order] == b.owner).all()
+    assert (a.box[order] == b.box).all()
+    assert (a.visible[order] == b.visible).all()
+
+
+def quarter_turn(scene: Scene) -> Scene:
+    """The scene turned clockwise: what was along +z is along +x."""
+
+    def turn(places: np.ndarray) -> np.ndarray:
+        return np.stack([places[..., 2], places[..., 1], -places[..., 0]], axis=-1)
+
+    objects = []
+    for item in scene.objects:
+        box = turn(item.box)
+        objects.append(dataclasses.replace(item, box=np.stack([box.min(0), box.max(0)])))
+    return dataclasses.replace(scene, points=turn(scene.points), objects=tuple(objects))
+
+
+def test_oriented_boxes_are_used() -> None:
+    # A thin sheet at 45 degrees: its axis-aligned box is 1 m wide, itself it hides a strip only.
+    half, thin = np.sqrt(0.125), 0.005
+    along, across = np.array([half, 0, half]), np.array([thin, 0, -thin])
+    flat = [-along - across, along - across, along + across, -along + across]
+    corners = np.array([np.add((0, toy.CAMERA + y, 1.0), v) for y in (-0.5, 0.5) for v in flat])
+    box = np.stack([corners.min(axis=0), corners.max(axis=0)])
+    sheet = SceneObject("Painting|0", "Painting", box, corners)
+    apple = toy.thing("Apple", (-0.28, toy.CAMERA, 1.05), (0.05,) * 3)
+    scene = toy.room(toy.line(1), sheet, apple)
+    assert solids_of(scene, RULES).aligned == 1
+    assert "Apple" not in seen(scene, 0, 0)
+    square = dataclasses.replace(sheet, corners=None)
+    assert "Apple" in seen(toy.room(toy.line(1), square, apple), 0, 0)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=6)
+def test_boxes_agree_with_dense_rays_in_random_rooms(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    scene = toy.random_room(draw)
+    states = draw.choice(len(scene.points) * 16, 3, replace=False)
+    overlaps, classes = agreement.compare_boxes(scene, RULES, states)
+    assert not overlaps or np.mean(overlaps) > 0.8
+    assert classes.extras + classes.misses <= 1
+
+
+def test_boxes_agree_with_dense_rays_in_real_rooms() -> None:
+    scenes = ithor.load_scenes()
+    draw = np.random.default_rng(0)
+    overlaps: list[float] = []
+    total = agreement.Count()
+    for number in (5, 48, 70, 101):
+        states = draw.choice(len(scenes[number].points) * 16, 3, replace=False)
+        more, classes = agreement.compare_boxes(scenes[number], RULES, states)
+        overlaps += more
+        total += classes
+    assert len(overlaps) > 50
+    assert np.mean(overlaps) > 0.9
+    assert min(total.precision, total.recall) > 0.95
+
+
+def test_agreement_with_the_published_flags() -> None:
+    scenes = ithor.load_scenes()
+    train = [scene for i, scene in enumerate(scenes) if i % 30 < 20]
+    test = [scene for i, scene in enumerate(scenes) if i % 30 >= 20]
+    for rooms, least in ((train, 0.95), (test, 0.93)):
+        total = sum(agreement.by_class(rooms, RULES).values(), agreement.Count())
+        assert total.f1 > least

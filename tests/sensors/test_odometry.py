@@ -1,0 +1,425 @@
+"""Dead reckoning and the map of the way: a slow trail of sets and degrees, and the rooms' truth."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tdanet_jax.env import dynamics
+from tdanet_jax.env.dynamics import EnvParams, EnvState, Observation
+from tdanet_jax.env.reward import no_parents
+from tdanet_jax.scenes import SceneTables
+from tdanet_jax.scenes.tables import build
+from tdanet_jax.sensors import odometry
+from tdanet_jax.sensors.odometry import Odometry, Trail
+from tests.support import toy
+from tests.support.oracle import (
+    DONE,
+    HEADINGS,
+    LOOK_DOWN,
+    LOOK_UP,
+    MOVE_AHEAD,
+    ROOMS,
+    ROTATE_LEFT,
+    ROTATE_RIGHT,
+    pose_of,
+)
+
+#: East and north of a step along each heading, in cells; oblique ones go along both axes.
+STEPS = {0: (0, 1), 45: (1, 1), 90: (1, 0), 135: (1, -1), 180: (0, -1), 225: (-1, -1),
+         270: (-1, 0), 315: (-1, 1)}  # fmt: skip
+#: Before the first action.
+NOTHING = 6
+#: What stands in the front and in the middle of the window [row, column].
+FRONT, MIDDLE, BEHIND = (3, 4), (4, 4), (5, 4)
+BLOCKED = 256
+
+AHEAD = [(MOVE_AHEAD, False)]
+Walk = Sequence[tuple[int, bool]]  # actions, and whether the agent did not move
+LONGEST = 120
+
+
+class SlowTrail:
+    """The way of one episode, in degrees, tuples and sets."""
+
+    def __init__(self, diagonal: bool, horizon: int) -> None:
+        self.x = self.z = 0
+        self.heading = 45 * diagonal
+        self.horizon = horizon
+        self.action = NOTHING
+        self.was_blocked = False
+        self.stood = {(0, 0, self.heading)}
+        self.in_the_way: set[tuple[int, int]] = set()
+
+    def follow(self, action: int, did_not_move: bool) -> None:
+        """An action, and whether it moved the agent."""
+        east, north = STEPS[self.heading]
+        self.action, self.was_blocked = action, action == MOVE_AHEAD and did_not_move
+        if self.was_blocked:
+            self.in_the_way.add(((self.x + east) % 64, (self.z + north) % 64))
+        elif action == MOVE_AHEAD:
+            self.x, self.z = self.x + east, self.z + north
+        elif action == ROTATE_LEFT:
+            self.heading = (self.heading - 45) % 360
+        elif action == ROTATE_RIGHT:
+            self.heading = (self.heading + 45) % 360
+        elif action in (LOOK_UP, LOOK_DOWN):
+            self.horizon = int(action == LOOK_DOWN)
+        self.stood.add((self.x % 64, self.z % 64, self.heading))
+
+    def motion(self) -> list[float]:
+        """The twelve numbers, from scalar products with the directions right and ahead."""
+        sine, cosine = (f(math.radians(self.heading)) for f in (math.sin, math.cos))
+        right = (0.25 * self.x * cosine - 0.25 * self.z * sine) / 4
+        ahead = (0.25 * self.x * sine + 0.25 * self.z * cosine) / 4
+        last = [float(self.action == action) for action in range(6)]
+        return [right, ahead, sine, cosine, self.horizon, self.was_blocked, *last]
+
+    def cell(self, row: int, column: int) -> tuple[int, int]:
+        """The cell of the map that the window shows there: the nearest one."""
+        right, ahead = column - 4, 4 - row
+        sine, cosine = (f(math.radians(self.heading)) for f in (math.sin, math.cos))
+        x = self.x + round(right * cosine + ahead * sine)
+        z = self.z + round(ahead * cosine - right * sine)
+        return x % 64, z % 64
+
+    def window(self) -> list[list[int]]:
+        """The bits of the 9 x 9 cells."""
+        rows = [[0] * 9 for _ in range(9)]
+        for row in range(9):
+            for column in range(9):
+                x, z = self.cell(row, column)
+                bits = BLOCKED if (x, z) in self.in_the_way else 0
+                for bit in range(8):
+                    if (x, z, (self.heading + 45 * bit) % 360) in self.stood:
+                        bits += 1 << bit
+                rows[row][column] = bits
+        return rows
+
+
+@functools.partial(jax.jit, static_argnames="map_too")
+def walked(
+    diagonal: Any, horizon: Any, actions: Any, blocked: Any, map_too: bool = False
+) -> tuple[Trail, tuple[Trail, Odometry]]:
+    """The last trail of a walk [N], and trail and senses at its start and after every action."""
+
+    def step(trail: Trail, given: tuple) -> tuple[Trail, tuple[Trail, Odometry]]:
+        trail = odometry.follow(trail, *given)
+        kept = trail if map_too else trail.replace(cells=jnp.zeros(0))
+        return trail, (kept, odometry.sense(trail))
+
+    begun = odometry.begin(jnp.int32(diagonal), jnp.int32(horizon))
+    actions = jnp.concatenate([jnp.array([NOTHING]), actions])
+    return jax.lax.scan(step, begun, (actions, jnp.append(True, blocked)))
+
+
+def columns(walk: Walk) -> tuple[np.ndarray, np.ndarray]:
+    """Actions and flags of a walk, filled up to `LONGEST` with turns: one shape is compiled."""
+    filled = [*walk, *[(ROTATE_LEFT, False)] * LONGEST][:LONGEST]
+    return np.array([a for a, _ in filled], np.int32), np.array([b for _, b in filled])
+
+
+#: Actions are drawn in runs of one kind, so that a walk also leads far.
+RUNS = st.lists(
+    st.tuples(
+        st.sampled_from((0, 0, 0, 1, 2, 3, 4, 5)), st.booleans(), st.sampled_from((1, 1, 2, 40))
+    ),
+    max_size=12,
+)
+
+
+@settings(max_examples=40)
+@given(diagonal=st.booleans(), horizon=st.integers(0, 1), runs=RUNS)
+def test_every_step_is_that_of_the_slow_trail(diagonal: bool, horizon: int, runs: list) -> None:
+    walk = [(action, blocked) for action, blocked, times in runs for _ in range(times)][:LONGEST]
+    last, found = walked(diagonal, horizon, *columns(walk))
+    trail, seen = jax.device_get(found)
+    slow = SlowTrail(diagonal, horizon)
+    for t in range(len(walk) + 1):
+        if t:
+            slow.follow(*walk[t - 1])
+        assert trail.cell[t].tolist() == [slow.x, slow.z]
+        assert (45 * trail.heading[t], trail.horizon[t]) == (slow.heading, slow.horizon)
+        assert (trail.action[t], trail.blocked[t]) == (slow.action, slow.was_blocked)
+        np.testing.assert_allclose(seen.motion[t], slow.motion(), atol=2e-6)
+        np.testing.assert_array_equal(seen.window[t], slow.window())
+    assert last.cells.shape == (64, 64)
+
+
+def wandering(seed: int, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """A random walk."""
+    rng = np.random.default_rng(seed)
+    actions = rng.choice(6, length, p=[0.5, 0.15, 0.15, 0.05, 0.05, 0.1])
+    return actions.astype(np.int32), rng.random(length) < 0.3
+
+
+def test_the_map_holds_the_whole_way_and_nothing_else() -> None:
+    actions, blocked = wandering(0, LONGEST)
+    last, _ = walked(1, 0, actions, blocked)
+    slow = SlowTrail(diagonal=True, horizon=0)
+    for action, flag in zip(actions, blocked, strict=True):
+        slow.follow(int(action), bool(flag))
+    cells = np.zeros((64, 64), int)
+    for x, z, heading in slow.stood:
+        cells[x, z] += 1 << heading // 45
+    for x, z in slow.in_the_way:
+        cells[x, z] += BLOCKED
+    np.testing.assert_array_equal(last.cells, cells)
+    assert len(slow.in_the_way) > 5
+
+
+@pytest.mark.parametrize("diagonal", [False, True])
+def test_beyond_64_cells_the_map_begins_anew_and_the_position_does_not(diagonal: bool) -> None:
+    _, (trail, seen) = walked(diagonal, 0, *columns([(MOVE_AHEAD, True), *66 * AHEAD]))
+    # After 62 steps the start is two cells ahead, and behind it comes the way that it went; what
+    # was in the way there is three cells ahead. Diagonal cells are as far as 1.4 rows.
+    assert trail.cell[63].tolist() == [62 * diagonal, 62]
+    assert [row for row in range(4) if seen.window[63, row, 4] & 1] == (
+        [0, 1] if diagonal else [0, 1, 2]
+    )
+    assert [row for row in range(4) if seen.window[63, row, 4] & BLOCKED] == [0 if diagonal else 1]
+    away = 62 / 16 * (math.sqrt(2) if diagonal else 1)
+    np.testing.assert_allclose(seen.motion[63, :2], [0, away], atol=1e-5)
+    # After 64 it stands on the start, as far as the map goes.
+    assert trail.cell[65].tolist() == [64 * diagonal, 64]
+    assert seen.window[65][FRONT] & BLOCKED
+
+
+def test_compiled_is_eager_and_many_are_one_by_one() -> None:
+    starts = [(0, 0), (1, 1), (1, 0)]
+    walks = [wandering(seed, 8) for seed in range(len(starts))]
+    alone = [walked(*start, *walk, map_too=True) for start, walk in zip(starts, walks, strict=True)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *alone)
+    given = (*np.array(starts).T, *(np.stack(x) for x in zip(*walks, strict=True)))
+    together = jax.vmap(functools.partial(walked, map_too=True))(*given)
+    close = {"rtol": 1e-6, "atol": 1e-6}  # sines and cosines may be computed in another way
+    chex.assert_trees_all_close(together, stacked, **close)
+    trail = odometry.begin(jnp.int32(1), jnp.int32(1))
+    for t, (action, flag) in enumerate(zip(*walks[1], strict=True), start=1):
+        trail = odometry.follow(trail, jnp.int32(action), jnp.asarray(flag))
+        eager = trail, odometry.sense(trail)
+        compiled = jax.tree.map(lambda x, t=t: x[t], alone[1][1])
+        chex.assert_trees_all_close(eager, compiled, **close)
+        chex.assert_trees_all_equal_dtypes(eager, compiled)
+
+
+@pytest.mark.parametrize("diagonal", [0, 1])
+@pytest.mark.parametrize("blocked", [False, True])
+def test_no_action_yet_changes_nothing(diagonal: int, blocked: bool) -> None:
+    begun = odometry.begin(jnp.int32(diagonal), jnp.int32(1))
+    after = odometry.follow(begun, jnp.int32(NOTHING), jnp.asarray(blocked))
+    chex.assert_trees_all_equal(after, begun)
+    chex.assert_trees_all_equal_dtypes(after, begun)
+
+
+def test_a_start_along_a_diagonal_senses_the_same_as_one_along_an_axis() -> None:
+    seen = [walked(d, 0, *columns([]))[1][1] for d in (0, 1)]
+    seen = [jax.tree.map(lambda x: x[0], found) for found in seen]
+    for start, turned in zip(seen, (0, math.sqrt(0.5)), strict=True):
+        expected = np.zeros((9, 9))
+        expected[MIDDLE] = 1
+        np.testing.assert_array_equal(start.window, expected)
+        motion = [0, 0, turned, math.sqrt(1 - turned**2), *[0] * 8]
+        np.testing.assert_allclose(start.motion, motion, atol=1e-6)
+    batch = jax.jit(odometry.sensed_at_start, static_argnums=(0, 1))(3, False)
+    for row in range(3):
+        chex.assert_trees_all_close(jax.tree.map(lambda x, r=row: x[r], batch), seen[0])
+
+
+@pytest.mark.parametrize("turns", range(8))
+def test_move_ahead_leads_to_the_cell_in_front_of_the_middle(turns: int) -> None:
+    walk = [*[(ROTATE_RIGHT, False)] * turns, (MOVE_AHEAD, True), *AHEAD]
+    _, (trail, seen) = walked(0, 0, *columns(walk))
+    turned, stopped, moved = (np.asarray(seen.window[turns + i]) for i in range(3))
+    assert not (turned & BLOCKED).any()
+    assert stopped[FRONT] == BLOCKED
+    # Only the nearest rows ahead may show the same cell once more, along a diagonal.
+    assert set(zip(*np.nonzero(stopped & BLOCKED), strict=True)) <= {FRONT, (2, 4)}
+    assert stopped[MIDDLE] == turned[MIDDLE]
+    assert stopped[MIDDLE] & 1
+    # And there it leads: the cell that was in front is the middle, and the old middle behind it.
+    assert moved[MIDDLE] == BLOCKED | 1
+    assert moved[BEHIND] == stopped[MIDDLE]
+    assert moved[FRONT] == 0 or turns % 2
+    east, north = STEPS[HEADINGS[turns]]
+    assert trail.cell[turns + 2].tolist() == [east, north]
+
+
+def test_headings_in_the_window_are_relative_to_ones_own() -> None:
+    walk = [(ROTATE_RIGHT, False), (ROTATE_RIGHT, False), (ROTATE_RIGHT, False)]
+    _, (_, seen) = walked(0, 0, *columns(walk))
+    # It looked 45, 90 and 135 degrees to the left of where it looks now.
+    assert seen.window[:4, *MIDDLE].tolist() == [1, 1 | 1 << 7, 1 | 3 << 6, 1 | 7 << 5]
+
+
+def test_all_numbers_are_the_motion_and_the_windows_bits_cell_by_cell() -> None:
+    rng = np.random.default_rng(0)
+    motion = rng.normal(size=(2, 3, 12)).astype(np.float32)
+    window = rng.integers(0, 512, (2, 3, 9, 9)).astype(np.uint16)
+    found = odometry.numbers(Odometry(jnp.asarray(motion), jnp.asarray(window)))
+    assert found.shape == (2, 3, 12 + 9 * 9 * 9)
+    assert found.dtype == jnp.float32
+    np.testing.assert_array_equal(found[..., :12], motion)
+    expected = [window[..., r, c] >> b & 1 for r in range(9) for c in range(9) for b in range(9)]
+    np.testing.assert_array_equal(found[..., 12:], np.stack(expected, axis=-1))
+
+
+# In the environment
+
+
+def params_of(tables: SceneTables, senses: bool, limits: Sequence[int] = (1000,) * 4) -> EnvParams:
+    """Episodes for every target in every room."""
+    targets = dict.fromkeys(ROOMS, tables.targets)
+    return dynamics.make_params(
+        tables, targets, no_parents(tables), limits, merge=False, odometry=senses
+    )
+
+
+@jax.jit
+def played(params: EnvParams, pose: jax.Array, actions: jax.Array) -> tuple[EnvState, Observation]:
+    """States and observations [N + 1, B] at the start of episodes and after each action [N, B]."""
+
+    def look(state: EnvState) -> tuple[EnvState, Observation]:
+        obs = jax.vmap(dynamics.observe, (0, None))(state, params)
+        trail = None if state.trail is None else state.trail.replace(cells=jnp.zeros(0))
+        return state.replace(trail=trail), obs
+
+    def step(state: EnvState, action: jax.Array) -> tuple[EnvState, Any]:
+        state = jax.vmap(dynamics.transition, (0, 0, None))(state, action, params).state
+        return state, look(state)
+
+    start = jax.vmap(dynamics.start, (None, 0, None))(params, pose, jnp.int32(0))
+    _, after = jax.lax.scan(step, start, actions)
+    return jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), look(start), after)
+
+
+@functools.cache
+def toy_rooms() -> SceneTables:
+    """Rooms with many holes in their grids."""
+    rng = np.random.default_rng(10)
+    rooms = [toy.random_room(rng, name=f"Random{i}") for i in range(8)]
+    return build([toy.corridor(), *rooms], targets=("Apple", "Mug", "Sofa"))
+
+
+@pytest.fixture(params=["real", "toy"])
+def tables(request: pytest.FixtureRequest) -> SceneTables:
+    if request.param == "toy":
+        return toy_rooms()
+    found: SceneTables = request.getfixturevalue("some_rooms")
+    return found
+
+
+def random_episodes(
+    tables: SceneTables, batch: int = 64, steps: int = 100
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses [B] of all headings and horizons, and actions [N, B], half of them MoveAhead."""
+    rng = np.random.default_rng(3)
+    pose = rng.integers(len(tables.position), size=batch) * 16 + np.arange(batch) % 16
+    actions = rng.choice(5, (steps, batch), p=[0.6, 0.15, 0.15, 0.05, 0.05])
+    return pose.astype(np.int32), actions.astype(np.int32)
+
+
+def test_dead_reckoning_is_the_true_displacement(tables: SceneTables) -> None:
+    pose, actions = random_episodes(tables)
+    state, obs = jax.device_get(played(params_of(tables, senses=True), pose, actions))
+    farthest, stopped = 0.0, 0
+    for b in range(len(pose)):
+        start = pose_of(int(pose[b]))
+        frame = start.heading // 90 * 90  # of a start along a diagonal, the axis to its left
+        sine, cosine = (round(f(math.radians(frame))) for f in (math.sin, math.cos))
+        slow = SlowTrail(start.heading != frame, start.horizon // 30)
+        for t in range(len(actions) + 1):
+            now = pose_of(int(state.pose[t, b]))
+            if t:
+                stays = state.pose[t, b] == state.pose[t - 1, b]
+                slow.follow(int(actions[t - 1, b]), bool(stays))
+                ahead = actions[t - 1, b] == MOVE_AHEAD
+                stopped += ahead and stays
+                assert state.trail.blocked[t, b] == (ahead and stays)
+                if ahead:
+                    assert bool(obs.odometry.window[t, b][FRONT] & BLOCKED) >= stays
+            x, _, z = (tables.position[now.position] - tables.position[start.position]) / 0.25
+            truth = x * cosine - z * sine, x * sine + z * cosine
+            np.testing.assert_allclose(state.trail.cell[t, b], truth, atol=1e-3)
+            assert (45 * state.trail.heading[t, b] + frame) % 360 == now.heading
+            assert 30 * state.trail.horizon[t, b] == now.horizon
+            farthest = max(farthest, *map(abs, truth))
+            if b % 8 == 5 and t % 5 == 0:  # the slow window takes its time
+                np.testing.assert_array_equal(obs.odometry.window[t, b], slow.window())
+        np.testing.assert_allclose(obs.odometry.motion[-1, b], slow.motion(), atol=2e-6)
+    # A point is reachable or it is not: nobody ever stood where something was in the way.
+    window = obs.odometry.window
+    assert not ((window & BLOCKED > 0) & (window & (BLOCKED - 1) > 0)).any()
+    assert farthest > (8 if len(tables.position) > 500 else 4)
+    assert stopped > 500
+
+
+def test_without_odometry_all_is_as_it_was(some_rooms: SceneTables) -> None:
+    pose, actions = random_episodes(some_rooms, batch=8, steps=20)
+    state, obs = played(params_of(some_rooms, senses=False), pose, actions)
+    assert state.trail is obs.odometry is None
+    sensing, more = played(params_of(some_rooms, senses=True), pose, actions)
+    assert sensing.trail is not None
+    assert more.odometry is not None
+    chex.assert_trees_all_equal(sensing.replace(trail=None), state)
+    chex.assert_trees_all_equal(more.replace(odometry=None), obs)
+
+
+def test_an_automatic_reset_begins_a_new_trail() -> None:
+    params = params_of(toy_rooms(), senses=True, limits=(7,) * 4)
+    reset, step = (jax.jit(jax.vmap(f, axes)) for f, axes in (
+        (dynamics.reset, (0, None)), (dynamics.step, (0, 0, 0, None)),
+    ))  # fmt: skip
+    batch, rng = 32, np.random.default_rng(4)
+    obs, state = reset(jax.random.split(jax.random.key(0), batch), params)
+    slow = [begun(state, b) for b in range(batch)]
+    ends = {"done": 0, "time-out": 0, "diagonal": 0}
+    for t in range(25):
+        actions = rng.choice(6, batch, p=[0.5, 0.1, 0.2, 0.05, 0.05, 0.1])
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(1), t), batch)
+        before = state
+        obs, state, _, terminated, truncated, info = step(keys, state, actions, params)
+        final = jax.device_get(info["final_state"])
+        for b in range(batch):
+            slow[b].follow(int(actions[b]), bool(final.pose[b] == before.pose[b]))
+            assert final.trail.cell[b].tolist() == [slow[b].x, slow[b].z]
+            assert final.trail.action[b] == actions[b]
+            if terminated[b] or truncated[b]:
+                assert terminated[b] == (actions[b] == DONE)
+                ends["done" if terminated[b] else "time-out"] += 1
+                slow[b] = begun(state, b)
+                ends["diagonal"] += slow[b].heading
+                fresh = odometry.begin(jnp.int32(slow[b].heading // 45), jnp.int32(0))
+                chex.assert_trees_all_equal(jax.tree.map(lambda x, b=b: x[b], state.trail), fresh)
+            np.testing.assert_array_equal(obs.odometry.window[b], slow[b].window())
+            np.testing.assert_allclose(obs.odometry.motion[b], slow[b].motion(), atol=2e-6)
+    assert min(ends.values()) > 10
+
+
+def begun(state: EnvState, b: int) -> SlowTrail:
+    """The slow trail at the start of the state's episode b."""
+    pose = pose_of(int(state.pose[b]))
+    return SlowTrail(pose.heading % 90 != 0, pose.horizon // 30)
+
+
+def test_choosing_episodes_chooses_their_trails() -> None:
+    params = params_of(toy_rooms(), senses=True)
+    states = [
+        jax.vmap(dynamics.start, (None, 0, None))(params, poses, jnp.int32(0))
+        for poses in (jnp.arange(0, 8), jnp.arange(16, 24))
+    ]
+    chosen = jnp.arange(8) % 3 == 0
+    found = dynamics.choose(chosen, *states)
+    for b in range(8):
+        one, new, old = (jax.tree.map(lambda x, b=b: x[b], s) for s in (found, *states))
+        chex.assert_trees_all_equal(one, new if chosen[b] else old)

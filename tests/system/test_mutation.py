@@ -1,0 +1,310 @@
+"""Do the tests notice? One fault at a time is put into a copy of the package, and they must fail.
+
+Slow: `pytest -m slow tests/system/test_mutation.py`.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+class Fault(NamedTuple):
+    """A change of one place of the source, and the tests that must notice."""
+
+    name: str
+    module: str  # path below tdanet_jax/
+    right: str
+    wrong: str
+    tests: str  # paths below tests/
+
+
+ENV, LEARNER, TDANET = "env/dynamics.py", "training/learner.py", "models/tdanet.py"
+ODOMETRY, TRIANGULATION = "sensors/odometry.py", "sensors/triangulation.py"
+TEST_TDANET = "models/test_tdanet.py"
+FAULTS = (
+    Fault("rotation sign", ODOMETRY, "Action.ROTATE_RIGHT, 1, 0", "Action.ROTATE_RIGHT, -1, 0",
+          "env/test_dynamics.py"),
+    Fault("impossible look", ODOMETRY, "Action.LOOK_UP, 0, horizon",
+          "Action.LOOK_UP, 1 - horizon, horizon", "env/test_dynamics.py"),
+    Fault("L without Done", ENV, "astype(jnp.int32) + 1\n", "astype(jnp.int32)\n", "env/test_dynamics.py"),
+    Fault("parent paid twice", ENV, "in_view & ((state.parents_seen & bits) == 0)", "in_view",
+          "env/test_reward.py"),
+    Fault("failed Done pays a parent", ENV, "jnp.where(~done & earns", "jnp.where(earns",
+          "env/test_reward.py"),
+    Fault("Done pays new parents only", ENV, "largest(fresh), largest(in_view)",
+          "largest(fresh), largest(fresh)", "env/test_reward.py"),
+    Fault("time-outs terminate", ENV, "terminated=done", "terminated=done | (steps >= limit)",
+          "env/test_dynamics.py"),
+    Fault("a step too many", ENV, "steps >= limit", "steps > limit", "env/test_dynamics.py"),
+    Fault("first padding row is valid", ENV, "dtype=jnp.int32) < last - first",
+          "dtype=jnp.int32) <= last - first", "env/test_dynamics.py"),
+    Fault("always the same rotation", ENV, "(bits[0] & 7)", "(bits[0] & 1)", "env/test_dynamics.py"),
+    Fault("starts that cannot reach", ENV, "valid = positions[reachable[positions, goal]]",
+          "valid = positions", "env/test_dynamics.py"),
+    Fault("centre of the extent", "sensors/detections.py", "first, _rows(centre, ",
+          "first, centre_and_area(", "env/test_dynamics.py"),
+    Fault("headings are not turned", ODOMETRY, "(turned | bits & BLOCKED)",
+          "(stood | bits & BLOCKED)", "sensors/test_odometry.py"),
+    Fault("what blocks is where one stands", ODOMETRY, "jnp.where(blocked, ahead, cell)", "cell",
+          "sensors/test_odometry.py"),
+    Fault("one visit is remembered", ODOMETRY, "trail.cells[at] | bit", "bit",
+          "sensors/test_odometry.py"),
+    Fault("the map ends", ODOMETRY, "[heading]) & (MAP - 1)", "[heading])", "sensors/test_odometry.py"),
+    Fault("every start is along an axis", ENV, "begin(rotation & 1,", "begin(rotation & 0,",
+          "sensors/test_odometry.py"),
+    Fault("the target moves along", TRIANGULATION, "moment - _dot(sighting.normal, moved)",
+          "moment + _dot(sighting.normal, moved)", "sensors/test_triangulation.py"),
+    Fault("the target's place is never moved", ODOMETRY,
+          "triangulation.follow(sighting, cell - trail.cell)", "sighting", "sensors/test_triangulation.py"),
+    Fault("rays of a level camera", TRIANGULATION, "down = horizon *", "down = 0 * horizon *",
+          "sensors/test_triangulation.py"),
+    Fault("no guess", TRIANGULATION, "GUESS = 1e-3", "GUESS = 0.0", "sensors/test_triangulation.py"),
+    Fault("a guess as good as a ray", TRIANGULATION, "GUESS = 1e-3", "GUESS = 1.0",
+          "sensors/test_triangulation.py"),
+    Fault("any box is the one seen before", TRIANGULATION, "same = _any_ray(sighting) & likely",
+          "same = _any_ray(sighting)", "sensors/test_triangulation.py"),
+    Fault("it goes on with any of several", TRIANGULATION,
+          "nearest = jnp.argmax(jnp.where(is_target, likeness, -2.0))",
+          "nearest = jnp.argmax(jnp.where(is_target, boxes[:, 2], -1.0))", "sensors/test_triangulation.py"),
+    Fault("it knows things by where it thought they were", TRIANGULATION,
+          "likely = _dot(directions[nearest], _direction(_solve(more)[0])) > SAME",
+          "likely = likeness[nearest] > SAME", "sensors/test_triangulation.py"),
+    Fault("a ray counts from where it was already seen", TRIANGULATION,
+          "directions[nearest], sighting.moved)", "directions[nearest], True)",
+          "sensors/test_triangulation.py"),
+    Fault("who came back has not moved", TRIANGULATION,
+          "moved=sighting.moved | jnp.any(cells != 0)", "moved=jnp.any(cells != 0)",
+          "sensors/test_triangulation.py"),
+    Fault("who has moved once always counts", TRIANGULATION,
+          "normal=normal, moved=jnp.zeros((), bool)", "normal=normal", "sensors/test_triangulation.py"),
+    Fault("distance in place of depth", TRIANGULATION,
+          "jnp.linalg.norm(_solve(seen)[0]) / lengths[chosen]", "jnp.linalg.norm(_solve(seen)[0])",
+          "sensors/test_triangulation.py"),
+    Fault("a radius is not renewed at one point", TRIANGULATION, "seen.replace(radius=radius)",
+          "seen.replace(radius=jnp.where(sighting.moved, radius, sighting.radius))",
+          "sensors/test_triangulation.py"),
+    Fault("the target's place is kept when the target changes", "agent/agent.py",
+          "memory.target != obs.target[0]", "False", "agent/test_agent.py"),
+    Fault("nothing is ever remembered of the target", "agent/agent.py",
+          "memory.target != obs.target[0]", "True", "agent/test_agent.py"),
+    Fault("it begins with the smallest", TRIANGULATION, "jnp.where(is_target, boxes[:, 2], -1.0)",
+          "jnp.where(is_target, -boxes[:, 2], -2.0)", "sensors/test_triangulation.py"),
+    Fault("a radius out of view is none", TRIANGULATION, "moment - _dot(sighting.normal, moved),",
+          "moment - _dot(sighting.normal, moved), radius=jnp.zeros(()),", "sensors/test_triangulation.py"),
+    Fault("certain of everything", TRIANGULATION, "within * certain,", "within,",
+          "sensors/test_triangulation.py"),
+    Fault("an agent that never looks", "agent/agent.py", "is_target = obs.mask[0] &",
+          "is_target = ~obs.mask[0] &", "agent/test_agent.py"),
+    Fault("nothing is seen at the start", ENV,
+          "state = state.replace(trail=_look(trail, state, params))",
+          "state = state.replace(trail=trail)", "sensors/test_triangulation.py"),
+    Fault("everything looks larger", ENV, "jnp.where(is_target, state.area_factor, 1.0)",
+          "state.area_factor", "env/test_size_noise.py"),
+    Fault("a box larger than the image", ENV,
+          "jnp.minimum(boxes[:, 2] * jnp.where(is_target, state.area_factor, 1.0), 1.0)",
+          "boxes[:, 2] * jnp.where(is_target, state.area_factor, 1.0)", "env/test_size_noise.py"),
+    Fault("the way goes on in the next episode", LEARNER, "env.choose(over, begun, moved.state)",
+          "env.choose(over, begun, moved.state).replace(trail=moved.state.trail)",
+          "training/test_learner.py"),
+    Fault("an agent that nothing stops", "agent/agent.py", "memory.action, blocked)",
+          "memory.action, jnp.zeros_like(blocked))", "agent/test_agent.py"),
+    Fault("an agent along an axis", "agent/agent.py", "eighths % 2", "0 * eighths",
+          "agent/test_agent.py"),
+    Fault("a trace without a way", "analysis/trace.py", "env.transition(state, action, params).state",
+          "state.replace(pose=env.move(params, state.pose, action))", "analysis/test_trace.py"),
+    Fault("share of all rooms", "env/reward.py", "gaps = gaps[np.isfinite(gaps)]",
+          "gaps = gaps[: support]", "env/test_reward.py"),
+    Fault("parents from all rooms", "task.py", "find_parents(seen_rooms", "find_parents(tables",
+          "env/test_zero_shot.py"),
+    Fault("hidden detections leak", "task.py",
+          "zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)",
+          "tables.subset(split.train_scenes)", "env/test_zero_shot.py"),
+    Fault("hidden words leak", "task.py",
+          "zero_shot.hide_words(words, tables.classes, split.hidden)", "words",
+          "env/test_zero_shot.py"),
+    Fault("hidden distances leak", "env/zero_shot.py", "target in hidden for target",
+          "False for target", "env/test_zero_shot.py"),
+    Fault("hidden visibility leaks", "env/zero_shot.py", "row_visible=tables.row_visible[keep_row]",
+          "row_visible=tables.row_visible[: keep_row.sum()]", "env/test_zero_shot.py"),
+    Fault("mask dropped", TDANET, "nn.softmax(logits, axis=-1, where=mask)",
+          "nn.softmax(logits, axis=-1)", TEST_TDANET),
+    Fault("empty frame has a word", TDANET, "jnp.where(obs.mask, weights, 0.0)", "weights",
+          TEST_TDANET),
+    Fault("difference without its absolute", TDANET, "jnp.abs(features - look_up",
+          "(features - look_up", TEST_TDANET),
+    Fault("boxes without attention", TDANET, "weights, obs.boxes)", "1.0 * obs.mask, obs.boxes)",
+          TEST_TDANET),
+    Fault("dropout without scale", TDANET, "features / (1 - self.dropout)", "features",
+          TEST_TDANET),
+    Fault("gates swapped", "models/layers.py", "f * cell + i * g", "i * cell + f * g",
+          "models/test_layers.py"),
+    Fault("no gradient through the cell", "models/layers.py", "grad_cell * f), fresh_t",
+          "0 * grad_cell), fresh_t", "models/test_layers.py"),
+    Fault("gradient across episodes", "models/layers.py", "keep = ~fresh[..., None]",
+          "keep = fresh[..., None] | True", "models/test_layers.py"),
+    Fault("time-outs not bootstrapped", LEARNER, "ended=over,", "ended=over | truncated,",
+          "training/test_learner.py"),
+    Fault("held steps counted", LEARNER, "counted = ~steps.held", "counted = steps.held | True",
+          "training/test_learner.py"),
+    Fault("carry of the last episode", LEARNER, "fresh=over,", "fresh=jnp.zeros_like(over),",
+          "training/test_learner.py"),
+    Fault("no value behind the rollout", LEARNER, "return after, steps, out.value",
+          "return after, steps, 0 * out.value", "training/test_learner.py"),
+    Fault("infinite updates applied", LEARNER, "jnp.where(finite, new, old)", "new",
+          "training/test_learner.py"),
+    Fault("the same episodes again", LEARNER, "fold_in(state.key, state.updates)",
+          "fold_in(state.key, 0)", "training/test_learner.py"),
+    Fault("entropy penalised", LEARNER, "- entropy_weight * entropy", "+ entropy_weight * entropy",
+          "training/test_learner.py"),
+    Fault("value over the episode's end", "training/gae.py", "gamma * (1.0 - ended)",
+          "gamma * (1.0 - held)", "training/test_gae.py"),
+    Fault("held advantage", "training/gae.py", "jnp.where(held_t, 0.0, delta_t",
+          "jnp.where(False, 0.0, delta_t", "training/test_gae.py"),
+    Fault("network forgets its actions", "evaluation/policies.py", "(table, carry, probs,",
+          "(table, carry, previous,", "evaluation/test_rollout.py"),
+    Fault("network forgets", "evaluation/policies.py", "jnp.zeros_like(fresh)), action", "fresh), action",
+          "evaluation/test_rollout.py"),
+    Fault("success after the end", "evaluation/rollout.py", "success | (alive & out.success)",
+          "success | out.success", "evaluation/test_rollout.py"),
+    Fault("bootstrap of episodes", "evaluation/metrics.py",
+          "_, member = np.unique(cluster, return_inverse=True)", "member = np.arange(len(cluster))",
+          "evaluation/test_metrics.py"),
+    Fault("L of five left out", "evaluation/metrics.py", "shortest >= least", "shortest > least",
+          "evaluation/test_metrics.py"),
+    Fault("differences of two samples", "evaluation/metrics.py", "mine - other, theirs", "mine, theirs",
+          "evaluation/test_metrics.py"),
+    Fault("compared with other episodes", "evaluation/comparison.py", '"x", "z", "rotation"', '"rotation"',
+          "evaluation/test_comparison.py"),
+    Fault("compared with other rooms", "evaluation/comparison.py", '("split", "data_version")', '("split",)',
+          "evaluation/test_comparison.py"),
+    Fault("a split's classes in the order they came", "vocabulary.py",
+          "name for name in ALL_TARGETS if name in named)", "named)", "test_vocabulary.py"),
+    Fault("validation holds out what is hidden", "vocabulary.py",
+          "for name in order if name not in missing", "for name in order", "test_vocabulary.py"),
+    Fault("own lists from other tables", "evaluation/episodes.py", "_committed(tables, split) or draw",
+          "draw", "evaluation/test_episodes.py"),
+    Fault("SPL without L", "evaluation/metrics.py", "success * shortest /", "success /", "evaluation/test_metrics.py"),
+    Fault("raw means", "words.py", "else norm / max(float(np.linalg.norm(mean)), 1e-12)",
+          "else norm", "test_words.py"),
+    Fault("checksums not compared", "training/checkpoint.py", "if expected.get(n) != found.get(n)",
+          "if False", "training/test_checkpoint.py"),
+    Fault("damaged checkpoint taken for the end", "training/checkpoint.py", "faults.append(error)", "raise",
+          "training/test_checkpoint.py"),
+    Fault("a damaged one outlives the next", "training/checkpoint.py", "if step <= updates][:KEPT]",
+          "][:KEPT]", "training/test_checkpoint.py"),
+    Fault("newer checkpoints passed over", "training/checkpoint.py", "raise  # it is sound",
+          "continue  # it is sound", "training/test_checkpoint.py"),
+    Fault("written in place", "io/files.py", 'path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")',
+          "path", "io/test_files.py"),
+    Fault("what is being written is removed", "io/files.py", "and not _runs(int(match[1]))", "",
+          "io/test_files.py"),
+    Fault("half-written files stay", "io/files.py", "        fresh.unlink(missing_ok=True)\n",
+          "        pass\n", "io/test_files.py"),
+    Fault("cache built by all at once", "scenes/cache.py", "        _lock(stack)\n", "",
+          "scenes/test_cache.py"),
+    Fault("cache read unchecked", "scenes/cache.py", "== assets.sha256(path)", "!= ''",
+          "scenes/test_cache.py"),
+    Fault("asset read unchecked", "io/assets.py", "sha256(file) != expected", "False",
+          "io/test_assets.py"),
+    Fault("rows lost on a full disk", "training/run.py", "self._waiting.clear()", "pass",
+          "system/test_faults.py"),
+    Fault("cut rows stay", "training/run.py", "file.truncate(", "file.tell() or (",
+          "system/test_faults.py"),
+    Fault("seeds beyond 32 bits", "config.py", "0 <= seed < 2**32", "0 <= seed",
+          "experiments/test_arguments.py"),
+    Fault("starts drawn anywhere", "evaluation/episodes.py", "valid = positions[reachable[positions, goal]]",
+          "valid = positions", "evaluation/test_episodes.py"),
+    Fault("padding has a row", "models/shared/class_rows.py", "jnp.where(obs.mask, table.row[obs.classes], n)",
+          "table.row[obs.classes]", "models/test_ssnet.py"),
+    Fault("no gradient from what nodes share", "models/shared/graph_convolutions.py",
+          'degree=jnp.einsum("nbh,bh->n", first, shared)', "degree=0 * weights.degree",
+          "models/test_mjolnir.py"),
+    Fault("inner steps uphill", "models/shared/adaptation.py", "-model.rate * product_grad",
+          "model.rate * product_grad", "models/shared/test_adaptation.py"),
+    Fault("largest of corrected moments", LEARNER, "bias_correction_nu=False",
+          "bias_correction_nu=True", "training/test_learner.py"),
+    Fault("every kernel is rounded", LEARNER, "x.ndim > 1 and x.size > SMALL", "x.ndim > 1",
+          "training/test_learner.py"),
+    Fault("the last call's product for all", "models/layers.py",
+          "(y, transposed) if once else ()", "(y, transposed)", "models/test_layers.py"),
+    Fault("the last step's kernel gradient", "models/layers.py",
+          "return total + over_rows(*step), None", "return over_rows(*step), None",
+          "models/test_layers.py"),
+    Fault("another column on GPUs", "models/layers.py", "one_hot(column, table.shape[1])",
+          "one_hot(column + 1, table.shape[1])", "models/test_layers.py"),
+    Fault("GPUs add in any order", "models/layers.py",
+          'if jax.default_backend() == "cpu":\n        return table[index]',
+          "if True:\n        return table[index]", "training/test_devices.py"),
+    Fault("devices exchange their rollouts", "models/layers.py",
+          "if a.ndim <= 2 or jax.default_backend()",
+          "a, b = a.reshape(-1, a.shape[-1]), b.reshape(-1, b.shape[-1])\n"
+          "    if a.ndim <= 2 or jax.default_backend()", "training/test_devices.py"),
+    Fault("all seeds become the first", "training/run.py", "lambda x, i=i: x[i]", "lambda x, i=i: x[0]",
+          "training/test_run.py"),
+    Fault("an agent that was passed on is trained over", "training/checkpoint.py",
+          "return (run / history.NETWORK).exists()", "return False", "evaluation/test_saved_networks.py"),
+    Fault("a stranger's model is imported", "config.py", "if config.model not in trusted:",
+          "if not config.model:", "test_config.py"),
+    Fault("the last of several budgets", "config.py", "max(done[name]", "min(done[name]",
+          "test_config.py"),
+    Fault("evaluation begins anywhere", ENV, "(tables.room_type == room) & chosen",
+          "tables.room_type == room", "env/test_zero_shot.py"),
+    Fault("any pickled name", "io/untrusted/pickles.py", "if name not in _ALLOWED and",
+          "if False and", "io/untrusted/test_pickles.py"),
+    Fault("source packages are built", "tools/build_assets.py", '"--only-binary=:all:", ', "",
+          "io/test_assets.py"),
+    Fault("used tables are removed", "scenes/cache.py", "st_mtime >= oldest", "st_mtime < oldest",
+          "scenes/test_cache.py"),
+    Fault("validation looks at own test rooms", "scenes/dataset.py",
+          "mine, rest = mine[:first], mine[first:]", "mine = mine[:first]",
+          "scenes/test_dataset.py"),
+)  # fmt: skip
+
+
+def passes(root: Path, tests: str) -> bool:
+    """Whether the tests pass in a copy of the repository."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider"]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run(
+        [*command, *(f"tests/{name}" for name in tests.split())],
+        cwd=root, env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode in (0, 1), done.stdout + done.stderr  # neither passed nor failed
+    return done.returncode == 0
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the repository; the tests in it see its own package."""
+    root = tmp_path_factory.mktemp("copy")
+    for name in ("tdanet_jax", "tests", "experiments", "assets", "agents"):
+        shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", root)
+    return root
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_each_fault_is_noticed(copy: Path, fault: Fault) -> None:
+    path = copy / "tdanet_jax" / fault.module
+    source = path.read_text()
+    assert source.count(fault.right) >= 1, "the source has changed: write the fault anew"
+    path.write_text(source.replace(fault.right, fault.wrong))
+    try:
+        assert not passes(copy, fault.tests)
+    finally:
+        path.write_text(source)
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_each_fault_still_has_its_place(fault: Fault) -> None:
+    assert fault.right in (ROOT / "tdanet_jax" / fault.module).read_text()

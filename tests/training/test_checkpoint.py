@@ -1,0 +1,214 @@
+"""Checkpoints: complete or absent, checked when read, the newest sound one taken."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import subprocess
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.env.dynamics import EnvParams
+from tdanet_jax.io import files
+from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.classes import Classes
+from tdanet_jax.scenes import SceneTables
+from tdanet_jax.task import make_model
+from tdanet_jax.training import checkpoint
+from tdanet_jax.training.checkpoint import Checkpoints
+from tdanet_jax.training.learner import TrainState, init
+from tests.env.test_dynamics import params_of
+from tests.support.handmade import lopsided
+
+
+def network(width: int) -> ActorCritic:
+    config = NetworkConfig(width=width, hidden=8, precision="float32")
+    return make_model(TrainConfig(network=config), Classes())
+
+
+MODEL = network(8)
+TABLES: SceneTables = lopsided()
+PARAMS: EnvParams = params_of(TABLES)
+WORDS = jnp.asarray(np.random.default_rng(0).normal(size=(len(TABLES.classes), 5)), jnp.float32)
+
+
+def make_state() -> TrainState:
+    return init(jax.random.key(3), LearnerConfig(num_envs=4), MODEL, WORDS, PARAMS)
+
+
+STATE = make_state()
+
+
+def after(updates: int) -> TrainState:
+    """A state that differs with the number of updates."""
+    params = jax.tree.map(lambda x: x + updates, STATE.params)
+    return STATE.replace(params=params, updates=jnp.int32(updates))
+
+
+def plain(state: TrainState) -> TrainState:
+    return state.replace(key=jax.random.key_data(state.key))
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Checkpoints:
+    """Two checkpoints, of 1 and of 2 updates."""
+    checkpoints = Checkpoints(tmp_path)
+    for updates in (1, 2):
+        checkpoints.save(after(updates), {"seconds": 0.5 * updates, "data_version": "d"})
+    return checkpoints
+
+
+def restored(checkpoints: Checkpoints) -> int:
+    """Restores, compares with what was saved, and returns its number of updates."""
+    state, meta = checkpoints.restore(make_state)
+    updates = int(state.updates)
+    chex.assert_trees_all_equal(plain(state), plain(after(updates)))
+    assert meta["seconds"] == 0.5 * updates
+    return updates
+
+
+def test_a_state_comes_back_bit_for_bit(saved: Checkpoints) -> None:
+    assert saved.latest() == 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert restored(saved) == 2
+        chex.assert_trees_all_equal(saved.snapshot().weights, after(2).params)
+
+
+def test_the_newest_two_are_kept(saved: Checkpoints) -> None:
+    saved.save(after(10), {})
+    assert sorted(path.name for path in saved.folder.iterdir()) == ["10", "2"]
+
+
+def test_checksums_are_what_sha256sum_reads(saved: Checkpoints) -> None:
+    command = ["sha256sum", "--check", "--strict", "--quiet", checkpoint.CHECKSUMS]
+    subprocess.run(command, cwd=saved.folder / "2", check=True)
+
+
+def flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def halve(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+DAMAGES = [
+    (which, damage)
+    for which in ("largest", "meta/metadata", "_CHECKPOINT_METADATA", checkpoint.CHECKSUMS)
+    for damage in (flip, halve, Path.unlink)
+    if (which, damage) != (checkpoint.CHECKSUMS, Path.unlink)  # the first versions wrote none
+]
+
+
+@pytest.mark.parametrize(("which", "damage"), DAMAGES)
+def test_a_damaged_checkpoint_is_passed_over_and_said_so(
+    saved: Checkpoints, which: str, damage: Callable[[Path], None]
+) -> None:
+    folder = saved.folder / "2"
+    largest = max((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+    damage(largest if which == "largest" else folder / which)
+    with pytest.warns(UserWarning, match="damaged checkpoint") as caught:
+        assert restored(saved) == 1
+    [message] = [str(warning.message) for warning in caught]
+    assert str(folder) in message
+    assert message.endswith("; taking checkpoint 1 in its place")
+    assert "\n" not in message
+    # The run goes on from there, past the damaged one, which it then replaces.
+    saved.save(after(2), {"seconds": 1.0})
+    assert restored(saved) == 2
+
+
+def test_a_damaged_checkpoint_does_not_outlive_the_next(saved: Checkpoints) -> None:
+    saved.save(after(9), {})
+    flip(saved.folder / "9" / "meta" / "metadata")
+    saved.save(after(3), {"seconds": 1.5})
+    assert sorted(path.name for path in saved.folder.iterdir()) == ["2", "3"]
+    assert restored(saved) == 3
+
+
+def test_a_checkpoint_of_a_newer_version_is_not_passed_over(
+    saved: Checkpoints, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "FORMAT", checkpoint.FORMAT + 1)
+        saved.save(after(3), {})
+    with pytest.raises(ValueError, match="a newer tdanet_jax wrote it"):
+        saved.restore(make_state)
+
+
+def test_a_disk_without_room_is_known_before_anything_is_written(
+    saved: Checkpoints, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nearly_full = shutil._ntuple_diskusage(10**9, 10**9 - 10, 10)
+    monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda folder: nearly_full)
+    with pytest.raises(ValueError, match=r"No space left on device: \S+ MB needed, 0\.0 MB free"):
+        saved.save(after(3), {})
+    assert saved.latest() == 2
+
+
+def test_all_damaged_is_one_clear_line(saved: Checkpoints) -> None:
+    for step in "12":
+        flip(saved.folder / step / "meta" / "metadata")
+    with pytest.raises(ValueError, match="2: damaged checkpoint") as caught:
+        saved.restore(make_state)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_checkpoint_without_checksums_is_read(saved: Checkpoints) -> None:
+    (saved.folder / "2" / checkpoint.CHECKSUMS).unlink()
+    assert restored(saved) == 2
+
+
+def test_what_is_half_written_is_no_checkpoint(saved: Checkpoints) -> None:
+    (saved.folder / "2").rename(saved.folder / f"{files.PARTIAL}2")
+    assert saved.latest() == 1
+    assert restored(saved) == 1
+
+
+def test_no_checkpoint(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path)
+    assert checkpoints.latest() is None
+    with pytest.raises(ValueError, match="no checkpoint"):
+        checkpoints.restore(make_state)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("part", ["state", "checksums", "rename"])
+def test_a_checkpoint_that_cannot_be_written_leaves_those_before_it(
+    saved: Checkpoints, part: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        if part == "state":
+            patch.setattr(saved._orbax, "save", full)
+        elif part == "checksums":
+            patch.setattr(checkpoint, "_checksums", full)
+        else:
+            patch.setattr(Path, "rename", full)
+        with pytest.raises(ValueError, match="3: checkpoint not written") as caught:
+            saved.save(after(3), {})
+    assert "No space left" in str(caught.value)
+    assert "the one before it is 2" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert sorted(path.name for path in saved.folder.iterdir()) == ["1", "2"]
+    assert restored(saved) == 2
+
+
+def test_a_checkpoint_of_another_network_is_refused(saved: Checkpoints) -> None:
+    wider = network(9)
+    config = dataclasses.replace(LearnerConfig(), num_envs=4)
+    with pytest.raises(ValueError, match="unreadable checkpoint"):
+        saved.restore(lambda: init(jax.random.key(0), config, wider, WORDS, PARAMS))

@@ -1,0 +1,537 @@
+"""Rollouts against the slow world, and the update against the gradient of the plain loss."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from tdanet_jax.config import LearnerConfig
+from tdanet_jax.env import dynamics
+from tdanet_jax.env.dynamics import EnvParams
+from tdanet_jax.env.reward import Parents
+from tdanet_jax.models import actor_critic
+from tdanet_jax.models.actor_critic import ActorCritic, Output
+from tdanet_jax.models.layers import Carry
+from tdanet_jax.models.tdanet import TDANetEncoder
+from tdanet_jax.training import learner
+from tdanet_jax.training.gae import advantages
+from tdanet_jax.training.learner import Rollout, TrainState
+from tests.support import handmade, oracle
+from tests.support.handmade import Room, Sighting, corridor, tables_of
+from tests.support.oracle import Episode, World, pose_of, state_of
+from tests.support.samples import randomised
+
+LIMITS = (4, 5, 3, 4)
+CLASSES = ("Bed", "CD", "CounterTop", "Mug", "Sink")
+WORTH = {"Mug": {"CounterTop": 0.375, "Sink": 0.125}, "CD": {"Bed": 0.25}}
+B, T = 24, 10
+
+
+def house() -> handmade.SceneTables:
+    """A kitchen with a mug and a bedroom with a CD, both small enough to be found by chance."""
+
+    def room(kind: str, *names: str) -> Room:
+        objects = [(name, (0.0, 0.0, 0.0)) for name in names]
+        others, sightings = range(1, len(names)), {}
+        for place in range(3):
+            for heading in range(0, 225, 45):
+                x, size = 600 + 4 * heading, 300 + 600 * place  # where it is tells where one is
+                box = (x, 1000, x + size, 1000 + size)
+                sightings[handmade.state(place, heading)] = [
+                    Sighting(0, box, visible=place > 0 and heading < 180),
+                    *(Sighting(i, box, heading == 45 * (i - 1 + place)) for i in others),
+                ]
+        return Room(kind, corridor(3), objects, sightings)
+
+    rooms = [room("kitchen", "Mug", "CounterTop", "Sink"), room("bedroom", "CD", "Bed")]
+    return tables_of(rooms, CLASSES, ["CD", "Mug"])
+
+
+TABLES = house()
+WORDS = jnp.asarray(np.random.default_rng(0).normal(size=(len(CLASSES), 4)), jnp.float32)
+MODEL = ActorCritic(TDANetEncoder(width=12, dropout=0.25), hidden=8)
+CONFIG = LearnerConfig(
+    num_envs=B, rollout_steps=T, learning_rate=9e-4, adam_epsilon=1e-5, final_entropy_weight=0.002
+)
+
+
+def house_params() -> EnvParams:
+    classes = np.full((2, 3), -1, np.int32)
+    reward = np.zeros((2, 3), np.float32)
+    for goal, target in enumerate(TABLES.targets):
+        for slot, (name, worth) in enumerate(WORTH[target].items()):
+            classes[goal, slot], reward[goal, slot] = CLASSES.index(name), worth
+    targets = {"kitchen": ["Mug"], "bedroom": ["CD"]}
+    return dynamics.make_params(TABLES, targets, Parents(classes, reward), LIMITS, merge=False)
+
+
+PARAMS = house_params()
+#: The same network and task for an agent that senses its way and where its target is, and for one
+#: that does not.
+SENSES = {"odometry": True, "triangulation": True}
+SENSING = {False: (MODEL, PARAMS), True: (MODEL.clone(**SENSES), PARAMS.replace(**SENSES))}
+begin = jax.jit(learner.init, static_argnums=(1, 2))
+rollout = jax.jit(learner.rollout, static_argnums=(2, 3))
+update = jax.jit(learner.update, static_argnums=(2, 3))
+
+
+def start(seed: int = 0, config: LearnerConfig = CONFIG, senses: bool = False) -> TrainState:
+    """A run with parameters that are far from the cautious initial ones."""
+    model, params = SENSING[senses]
+    state = begin(jax.random.key(seed), config, model, WORDS, params)
+    leaves, tree = jax.tree.flatten(state.params)
+    rng = np.random.default_rng(seed)
+    noise = [jnp.asarray(0.3 * rng.normal(size=x.shape), jnp.float32) for x in leaves]
+    changed = jax.tree.unflatten(tree, [x + n for x, n in zip(leaves, noise, strict=True)])
+    return state.replace(params=changed)
+
+
+@functools.cache
+def example(
+    senses: bool = False,
+) -> tuple[TrainState, TrainState, Rollout, jax.Array, jax.Array]:
+    """A state in mid-training, the state after its rollout, the rollout, values, advantages."""
+    model, params = SENSING[senses]
+    state = start(senses=senses)
+    before, *_ = rollout(state, jax.random.key(1), CONFIG, model, WORDS, params)
+    after, steps, last = rollout(before, jax.random.key(2), CONFIG, model, WORDS, params)
+    return before, after, steps, last, advantages_of(steps, last)
+
+
+@jax.jit
+def forward(weights: Any, carry: Carry, *seen: Any) -> tuple[Carry, Output]:
+    """The network without a tape."""
+    table = actor_critic.prepare(MODEL, weights, WORDS)
+    return actor_critic.forward(MODEL, weights, table, carry, *seen)
+
+
+def advantages_of(steps: Rollout, last: jax.Array) -> jax.Array:
+    flags = (steps.ended, steps.held)
+    return advantages(steps.reward, steps.value, last, *flags, CONFIG.gamma, CONFIG.gae_lambda)
+
+
+@pytest.mark.parametrize("bootstrap", [True, False])
+def test_rollouts_follow_the_slow_world_and_hold_time_outs_for_one_step(bootstrap: bool) -> None:
+    config = dataclasses.replace(CONFIG, rollout_steps=1, bootstrap_truncated=bootstrap)
+    world = World(TABLES, WORTH, LIMITS)
+    state = start(3, config)
+    episodes = [begun(state, b) for b in range(B)]
+    waiting = np.zeros(B, bool)
+    seen = {"success": 0, "time-out": 0, "held": 0}
+    for t in range(40):
+        before = jax.device_get(state)
+        key = jax.random.fold_in(jax.random.key(4), t)
+        state, steps, _ = rollout(state, key, config, MODEL, WORDS, PARAMS)
+        step: Rollout = jax.device_get(jax.tree.map(lambda x: x[0], steps._replace(tape=None)))
+        after = jax.device_get(state)
+        np.testing.assert_array_equal(step.held, waiting)
+        np.testing.assert_array_equal(step.fresh, before.fresh)
+        np.testing.assert_array_equal(step.previous, before.previous)
+        chosen = after.previous[np.arange(B), step.action]
+        for b in range(B):
+            fresh = waiting[b]
+            if waiting[b]:
+                # The last state of a truncated episode: nothing happens, then a new episode.
+                seen["held"] += 1
+                assert float(step.reward[b]) == 0
+                assert bool(step.ended[b])
+                assert not step.over[b]
+                assert not step.success[b]
+                waiting[b] = False
+            else:
+                expected = world.act(episodes[b], int(step.action[b]))
+                assert float(step.reward[b]) == pytest.approx(expected.reward, abs=1e-6)
+                assert bool(step.success[b]) == expected.success
+                assert bool(step.over[b]) == (expected.terminated or expected.truncated)
+                assert int(step.length[b]) == episodes[b].steps
+                assert int(step.shortest[b]) == int(before.env_state.shortest[b])
+                waiting[b] = expected.truncated and bootstrap
+                fresh = (expected.terminated or expected.truncated) and not waiting[b]
+                assert bool(step.ended[b]) == fresh
+                seen["success"] += expected.success
+                seen["time-out"] += expected.truncated
+            assert bool(after.fresh[b]) == fresh
+            if fresh:
+                assert not after.previous[b].any()
+                episodes[b] = begun(state, b)
+            else:
+                # The episode goes on: its own last state, and the policy's own probabilities.
+                assert int(after.env_state.pose[b]) == state_of(episodes[b].pose)
+                assert after.previous[b].sum() == pytest.approx(1, abs=1e-5)
+                assert np.log(chosen[b]) == pytest.approx(step.log_prob[b], abs=1e-5)
+        np.testing.assert_array_equal(after.held, waiting)
+        if t % 8 == 0:
+            agrees_with_observe(step, before)
+    assert min(seen["success"], seen["time-out"]) > 20
+    assert (seen["held"] > 20) == bootstrap
+
+
+def begun(state: TrainState, b: int) -> Episode:
+    """The episode that the slow world should play beside the state's row b."""
+    row = jax.tree.map(lambda x: x[b], state.env_state)
+    assert int(row.steps) == 0
+    return Episode(pose_of(int(row.pose)), TABLES.targets[int(row.target)])
+
+
+def agrees_with_observe(step: Rollout, before: TrainState) -> None:
+    """The network saw the state that it acted in (or valued, where an episode was cut)."""
+    expected = jax.vmap(dynamics.observe, (0, None))(before.env_state, PARAMS)
+    chex.assert_trees_all_equal(step.obs, jax.device_get(expected))
+
+
+def test_recorded_values_and_probabilities_are_those_of_the_network() -> None:
+    before, after, steps, last, _ = example()
+    seen = (steps.obs, steps.previous, steps.fresh, steps.keep)
+    carry, out = forward(before.params, before.carry, *seen)
+    log_probs = jax.nn.log_softmax(out.logits)
+    log_prob = jnp.take_along_axis(log_probs, steps.action[..., None], -1)[..., 0]
+    # The same float32 sums, taken over all steps at once.
+    close = {"rtol": 1e-4, "atol": 1e-5}
+    chex.assert_trees_all_close((steps.value, steps.log_prob), (out.value, log_prob), **close)
+    chex.assert_trees_all_close(after.carry, carry, **close)
+    # Behind the rollout stands the state that the next one starts from, without dropout.
+    obs = jax.vmap(dynamics.observe, (0, None))(after.env_state, PARAMS)
+    _, out = forward(before.params, after.carry, obs, after.previous, after.fresh)
+    chex.assert_trees_all_close(last, out.value, **close)
+
+
+def test_carries_cross_the_borders_of_rollouts() -> None:
+    before, after, _, _, _ = example()
+    going_on = ~np.asarray(before.fresh)
+    assert going_on.any()
+    assert np.asarray(before.carry[0])[going_on].any(axis=-1).all()
+    assert not np.array_equal(after.carry[0], before.carry[0])
+
+
+@functools.partial(jax.jit, static_argnames="model")
+def gradient(
+    state: TrainState,
+    steps: Rollout,
+    advantage: jax.Array,
+    entropy: jax.Array,
+    model: ActorCritic = MODEL,
+) -> Any:
+    """Loss, its parts and its gradient for the parameters that acted."""
+
+    def total(params: Any) -> Any:
+        arguments = (steps, advantage, state.carry, entropy, CONFIG, model, WORDS)
+        return learner.loss(params, *arguments)
+
+    return jax.value_and_grad(total, has_aux=True)(state.params)
+
+
+@pytest.mark.parametrize("senses", [False, True], ids=["plain", "triangulation"])
+def test_the_tape_changes_neither_the_loss_nor_its_gradient(senses: bool) -> None:
+    before, _, steps, _, advantage = example(senses)
+    model, _ = SENSING[senses]
+    taped = gradient(before, steps, advantage, 0.01, model=model)
+    plain = gradient(before, steps._replace(tape=None), advantage, 0.01, model=model)
+    # float32 sums over 240 states, in another order.
+    chex.assert_trees_all_close(taped, plain, rtol=2e-4, atol=2e-6)
+    if senses:
+        assert "way" in steps.tape
+        assert all(np.asarray(grad).any() for grad in taped[1]["way"].values())
+
+
+def test_what_is_sensed_of_the_way_begins_with_every_episode_and_goes_on_in_it() -> None:
+    _, after, steps, *_ = example(senses=True)
+    whole = jax.tree.map(
+        lambda *x: jnp.concatenate([x[0], x[1][None]]),
+        (steps.obs, steps.fresh),
+        (jax.vmap(dynamics.observe, (0, None))(after.env_state, SENSING[True][1]), after.fresh),
+    )
+    obs, fresh = jax.device_get(whole)  # [T + 1, B]
+    sensed = obs.odometry
+    seen = (obs.mask & (obs.classes == obs.target[..., None])).any(axis=-1)
+    known = sensed.target.any(axis=-1)
+    # At first what is in view is all that is known; later, all that was.
+    np.testing.assert_array_equal(known[fresh], seen[fresh])
+    np.testing.assert_array_equal(known[1:], seen[1:] | (known[:-1] & ~fresh[1:]))
+    assert (known & ~seen).any()
+    assert (known[:-1] & ~known[1:]).any()
+    here = np.zeros((9, 9), bool)
+    here[4, 4] = True
+    for t, b in np.ndindex(T + 1, B):
+        place, last = sensed.motion[t, b, :2], sensed.motion[t, b, 6:]
+        if fresh[t, b]:
+            assert not place.any()
+            assert not last.any()
+            np.testing.assert_array_equal(sensed.window[t, b], here)
+        elif t:
+            # Where a time-out waits to be valued, too: the way to the episode's last state.
+            np.testing.assert_array_equal(last, np.eye(6)[steps.action[t - 1, b]])
+            assert sensed.window[t, b][4, 4] & 1
+    assert fresh[1:].sum() > 20
+    assert steps.held.any()
+    assert np.abs(sensed.motion[..., :2]).max() > 0
+
+
+def test_the_loss_is_the_one_that_is_documented() -> None:
+    before, _, steps, _, advantage = example()
+    (total, parts), _ = gradient(before, steps, advantage, 0.03)
+    seen = (steps.obs, steps.previous, steps.fresh, steps.keep)
+    _, out = forward(before.params, before.carry, *seen)
+    logits, value = np.asarray(out.logits, np.float64), np.asarray(out.value, np.float64)
+    policy, critic, entropy, count = 0.0, 0.0, 0.0, 0
+    for t in range(T):
+        for b in range(B):
+            if steps.held[t, b]:
+                continue
+            count += 1
+            p = np.exp(logits[t, b]) / np.exp(logits[t, b]).sum()
+            advantage_tb = float(advantage[t, b])
+            policy -= np.log(p[int(steps.action[t, b])]) * advantage_tb
+            critic += 0.5 * (float(steps.value[t, b]) + advantage_tb - value[t, b]) ** 2
+            entropy -= (p * np.log(p)).sum()
+    assert 0 < count < T * B, "the rollout should hold both kinds of steps"
+    assert float(parts["policy_loss"]) == pytest.approx(policy / count, rel=1e-4)
+    assert float(parts["value_loss"]) == pytest.approx(critic / count, rel=1e-4)
+    assert float(parts["entropy"]) == pytest.approx(entropy / count, rel=1e-4)
+    expected = (policy + CONFIG.value_weight * critic - 0.03 * entropy) / count
+    assert float(total) == pytest.approx(expected, rel=1e-4)
+
+
+def test_held_steps_do_not_count() -> None:
+    before, _, steps, _, advantage = example()
+    held = steps.held
+    assert held.any()
+    other = steps._replace(
+        action=jnp.where(held, (steps.action + 1) % 6, steps.action),
+        value=jnp.where(held, 100.0, steps.value),
+        reward=jnp.where(held, 50.0, steps.reward),
+    )
+    chex.assert_trees_all_equal(
+        gradient(before, steps, advantage, 0.01),
+        gradient(before, other, jnp.where(held, 7.0, advantage), 0.01),
+    )
+
+
+def torch_amsgrad(rate: float, epsilon: float) -> optax.GradientTransformation:
+    """torch.optim.Adam(amsgrad=True), line by line as PyTorch's first versions compute it."""
+
+    def init(params: Any) -> Any:
+        return (0, *(jax.tree.map(jnp.zeros_like, params) for _ in range(3)))
+
+    def step(grads: Any, memory: Any, params: Any = None) -> Any:
+        count, first, second, largest = memory
+        count += 1
+        first = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, first, grads)
+        second = jax.tree.map(lambda v, g: 0.999 * v + 0.001 * g * g, second, grads)
+        largest = jax.tree.map(jnp.maximum, largest, second)
+        size = rate * np.sqrt(1 - 0.999**count) / (1 - 0.9**count)
+        change = jax.tree.map(lambda m, v: -size * m / (jnp.sqrt(v) + epsilon), first, largest)
+        return change, (count, first, second, largest)
+
+    return optax.GradientTransformation(init, step)
+
+
+def test_amsgrad_forgets_a_large_first_gradient_no_faster_than_torch() -> None:
+    config = dataclasses.replace(CONFIG, amsgrad=True, max_grad_norm=1e9)
+    ours, theirs = learner.make_optimizer(config), torch_amsgrad(1.0, config.adam_epsilon)
+    params = jnp.zeros(3)
+    state, memory = ours.init(params), theirs.init(params)
+    for number in range(50):
+        grads = jnp.array([1.0, -2.0, 0.5]) * (100.0 if number == 0 else 1.0)
+        change, state = ours.update(grads, state, params)
+        expected, memory = theirs.update(grads, memory, params)
+        np.testing.assert_allclose(-change, expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("amsgrad", "progress"), [(False, 0.25), (True, 0.0)])
+def test_an_update_is_one_step_of_clipped_adam_on_the_gradient_of_the_loss(
+    amsgrad: bool, progress: float
+) -> None:
+    config = dataclasses.replace(CONFIG, amsgrad=amsgrad)
+    state = start(5)
+    rate = 9e-4 * (1 - progress)
+    entropy = 0.01 + progress * (0.002 - 0.01)
+    reference = optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm),
+        torch_amsgrad(rate, config.adam_epsilon)
+        if amsgrad
+        else optax.adam(rate, eps=config.adam_epsilon),
+    )
+    memory = reference.init(state.params)
+    state = state.replace(opt_state=learner.make_optimizer(config).init(state.params))
+    for number in range(2):
+        key = jax.random.fold_in(state.key, number)
+        _, steps, last = rollout(state, key, CONFIG, MODEL, WORDS, PARAMS)
+        advantage = advantages_of(steps, last)
+        grads = gradient(state, steps._replace(tape=None), advantage, entropy)[1]
+        change, memory = reference.update(grads, memory, state.params)
+        expected = optax.apply_updates(state.params, change)
+        state, _ = update(state, jnp.float32(progress), config, MODEL, WORDS, PARAMS)
+        assert int(state.updates) == number + 1
+        # Adam divides by the gradient's own size: where that is tiny, its rounding shows.
+        chex.assert_trees_all_close(state.params, expected, rtol=1e-4, atol=2e-5)
+
+
+def test_only_large_kernels_are_rounded_while_acting() -> None:
+    model = ActorCritic(TDANetEncoder(width=12, dtype=jnp.bfloat16), hidden=8, dtype=jnp.bfloat16)
+    state = begin(jax.random.key(1), CONFIG, model, WORDS, PARAMS)
+    state = state.replace(params=randomised(state.params, seed=2))
+    _, steps, _ = rollout(state, jax.random.key(3), CONFIG, model, WORDS, PARAMS)
+    assert max(x.size for x in jax.tree.leaves(state.params)) < learner.SMALL
+    obs = jax.vmap(dynamics.observe, (0, None))(state.env_state, PARAMS)
+    table = actor_critic.prepare(model, state.params, WORDS)
+    seen = (state.carry, obs, state.previous, state.fresh)
+    _, out = actor_critic.forward(model, state.params, table, *seen)
+    np.testing.assert_allclose(steps.value[0], out.value, rtol=1e-5)
+
+
+def test_the_explained_variance_is_that_of_the_returns_that_count() -> None:
+    state, progress = start(7), jnp.float32(0)
+    key = jax.random.fold_in(state.key, 0)
+    _, steps, last = rollout(state, key, CONFIG, MODEL, WORDS, PARAMS)
+    advantage = np.asarray(advantages_of(steps, last))
+    counted = ~np.asarray(steps.held)
+    returns = (np.asarray(steps.value) + advantage)[counted]
+    _, metrics = update(state, progress, CONFIG, MODEL, WORDS, PARAMS)
+    expected = 1 - advantage[counted].var() / returns.var()
+    assert float(metrics["explained_variance"]) == pytest.approx(expected, rel=1e-3, abs=1e-4)
+    assert float(metrics["learning_rate"]) == pytest.approx(9e-4)
+
+
+def test_schedules_reach_their_end_and_stay_there() -> None:
+    state = start(6)
+    for progress in (1.0, 1.5):
+        after, _ = update(state, jnp.float32(progress), CONFIG, MODEL, WORDS, PARAMS)
+        chex.assert_trees_all_equal(after.params, state.params)  # the final learning rate is 0
+
+
+def test_metrics_are_sums_over_the_episodes_that_finished() -> None:
+    state = start(7)
+    after, metrics = update(state, jnp.float32(0), CONFIG, MODEL, WORDS, PARAMS)
+    key = jax.random.fold_in(state.key, state.updates)
+    _, steps, _ = rollout(state, key, CONFIG, MODEL, WORDS, PARAMS)
+    won, least, taken = [], [], []
+    for t in range(T):
+        for b in range(B):
+            if steps.over[t, b]:
+                won.append(bool(steps.success[t, b]))
+                least.append(int(steps.shortest[t, b]))
+                taken.append(int(steps.length[t, b]))
+    rate, spl = oracle.success_rate_and_spl(won, least, taken)
+    assert 5 < sum(won) < len(won)
+    assert int(metrics["episodes"]) == int(after.episodes) == len(won)
+    assert float(metrics["success_sum"]) == sum(won)
+    assert 100 * float(metrics["success_sum"]) / len(won) == pytest.approx(rate)
+    assert 100 * float(metrics["spl_sum"]) / len(won) == pytest.approx(spl, rel=1e-5)
+    assert int(metrics["length_sum"]) == sum(taken)
+    assert int(metrics["held_steps"]) == int(steps.held.sum()) > 0
+    assert float(metrics["reward_sum"]) == pytest.approx(float(steps.reward.sum()), rel=1e-5)
+    assert int(update(after, jnp.float32(0), CONFIG, MODEL, WORDS, PARAMS)[0].episodes) > len(won)
+
+
+@pytest.mark.parametrize("fault", ["rewards", "words"])
+def test_a_gradient_that_is_not_finite_skips_the_update_and_is_counted(fault: str) -> None:
+    state, _ = update(start(8), jnp.float32(0), CONFIG, MODEL, WORDS, PARAMS)
+    params, words = PARAMS, WORDS
+    if fault == "rewards":
+        params = PARAMS.replace(parent_reward=PARAMS.parent_reward + jnp.inf)
+    else:
+        words = WORDS.at[0].set(jnp.nan)
+    after, metrics = update(state, jnp.float32(0), CONFIG, MODEL, words, params)
+    assert not np.isfinite(float(metrics["grad_norm"]))
+    chex.assert_trees_all_equal((after.params, after.opt_state), (state.params, state.opt_state))
+    assert int(after.skipped) == 1
+    assert int(after.updates) == 2
+    assert int(after.episodes) > int(state.episodes)
+    # Once the fault is gone, training goes on with what was kept.
+    for _ in range(3):
+        after, metrics = update(after, jnp.float32(0), CONFIG, MODEL, WORDS, PARAMS)
+    assert np.isfinite(float(metrics["grad_norm"]))
+    assert int(after.skipped) < 4
+    chex.assert_tree_all_finite(after.params)
+    assert not np.array_equal(after.params["actor"]["kernel"], state.params["actor"]["kernel"])
+
+
+def data(state: TrainState) -> TrainState:
+    """The state with its random key as numbers."""
+    return state.replace(key=jax.random.key_data(state.key))
+
+
+def test_equal_keys_give_equal_runs_and_others_do_not() -> None:
+    runs = []
+    for seed in (9, 9, 10):
+        state = begin(jax.random.key(seed), CONFIG, MODEL, WORDS, PARAMS)
+        for _ in range(2):
+            state, _ = update(state, jnp.float32(0), CONFIG, MODEL, WORDS, PARAMS)
+        runs.append(state)
+    chex.assert_trees_all_equal(data(runs[0]), data(runs[1]))
+    assert not np.array_equal(runs[0].env_state.pose, runs[2].env_state.pose)
+    assert not np.array_equal(runs[0].params["actor"]["kernel"], runs[2].params["actor"]["kernel"])
+
+
+def test_updates_do_not_repeat_their_randomness() -> None:
+    state = start(11)
+    later = state.replace(updates=jnp.int32(1))
+    one, _ = update(state, jnp.float32(0), CONFIG, MODEL, WORDS, PARAMS)
+    two, _ = update(later, jnp.float32(0), CONFIG, MODEL, WORDS, PARAMS)
+    assert not np.array_equal(one.env_state.pose, two.env_state.pose)
+
+
+def test_a_chunk_of_updates_equals_single_ones() -> None:
+    chunk = learner.make_train(CONFIG, MODEL, 3)
+    whole, metrics = chunk(start(12), jnp.array([0.0, 0.3]), WORDS, PARAMS)
+    state = start(12)
+    rows = []
+    for share in (0.0, 0.1, 0.2):
+        state, row = update(state, jnp.float32(share), CONFIG, MODEL, WORDS, PARAMS)
+        rows.append(row)
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *rows)
+    # Two compilations may order float32 sums differently; whole numbers must agree exactly.
+    chex.assert_trees_all_close(metrics, stacked, rtol=1e-4, atol=1e-5)
+    chex.assert_trees_all_close(data(whole), data(state), rtol=1e-3, atol=1e-5)
+    chex.assert_trees_all_equal(whole.env_state, state.env_state)
+    assert int(whole.updates) == 3
+
+
+def test_a_chunk_is_traced_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    chex.clear_trace_counter()
+    monkeypatch.setattr(learner, "update", chex.assert_max_traces(learner.update, n=1))
+    chunk = learner.make_train(CONFIG, MODEL, 2)
+    state = start(13)
+    shapes = jax.tree.map(lambda x: (x.shape, x.dtype), data(state))
+    for share in (0.0, 0.5):
+        state, _ = chunk(state, jnp.array([share, share + 0.5]), WORDS, PARAMS)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), data(state)) == shapes
+
+
+def test_dropout_keeps_its_share_and_is_off_at_zero() -> None:
+    *_, steps, _, _ = example()
+    assert steps.keep is not None
+    kept = np.asarray(steps.keep)
+    # 2,880 draws at 0.75: the standard deviation of their mean is 0.008.
+    assert abs(kept.mean() - 0.75) < 0.04
+    assert len(np.unique(kept.reshape(-1, kept.shape[-1]), axis=0)) > T * B / 4
+    none = ActorCritic(TDANetEncoder(width=12, dropout=0.0), hidden=8)
+    state = begin(jax.random.key(0), CONFIG, none, WORDS, PARAMS)
+    _, steps, _ = rollout(state, jax.random.key(1), CONFIG, none, WORDS, PARAMS)
+    assert steps.keep is None
+
+
+def test_a_small_task_is_learnt() -> None:
+    config = LearnerConfig(
+        num_envs=64, rollout_steps=20, learning_rate=3e-3, entropy_weight=0.02,
+        final_entropy_weight=0.0,
+    )  # fmt: skip
+    params = PARAMS.replace(step_limit=jnp.full(4, 25, jnp.int32))
+    model = ActorCritic(TDANetEncoder(width=32, dropout=0.1), hidden=32)
+    state = begin(jax.random.key(14), config, model, WORDS, params)
+    chunk = learner.make_train(config, model, 600)
+    _, metrics = chunk(state, jnp.array([0.0, 1.0]), WORDS, params)
+    success = np.asarray(metrics["success_sum"]) / np.asarray(metrics["episodes"])
+    efficiency = np.asarray(metrics["spl_sum"]) / np.asarray(metrics["episodes"])
+    assert success[:10].mean() < 0.3
+    assert success[-50:].mean() > 0.95
+    assert efficiency[-50:].mean() > 3 * efficiency[:10].mean()
+    assert int(metrics["episodes"].sum()) > 10_000
