@@ -1,6 +1,6 @@
 """Mutated files: whatever is wrong with a file from outside ends in one clear line.
 
-The fast tier tries a few hundred mutations; `pytest -m slow tests/system/test_fuzz.py` tries 12,000.
+The fast tier tries a few hundred mutations, `pytest -m slow tests/system/test_fuzz.py` 12,000.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Training does not grow. Slow: `pytest -m slow tests/system/test_soak.py`; see soak.py for an hour."""
+"""Training does not grow. Slow: `pytest -m slow tests/system/test_soak.py`; an hour: soak.py."""
 
 import pytest
 

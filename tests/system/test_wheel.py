@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 #: Reads the page's template and every bundled file, whose checksums are looked at.
 READ = """
 import importlib.resources, json
-from tdanet_jax import assets
+from tdanet_jax.io import assets
 names = json.loads((assets.folder() / assets.CHECKSUMS).read_text())
 print(*[assets.path(name) for name in names], sep="\\n")
 print(importlib.resources.files("tdanet_jax").joinpath("analysis/replay.html"))
