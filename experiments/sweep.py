@@ -127,7 +127,8 @@ def train_all(
       configs: what to train.
     """
     from tdanet_jax.models.classes import Classes
-    from tdanet_jax.task import make_model, resolve
+    from tdanet_jax.models.registry import make_model
+    from tdanet_jax.task import resolve
     from tdanet_jax.training import devices
 
     devices.connect(training.devices)

@@ -37,6 +37,7 @@ from experiments.console import (
 )
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, PRESETS, TrainConfig, run_name
+from tdanet_jax.models.registry import MODELS
 
 if TYPE_CHECKING:
     from tdanet_jax.evaluation.episodes import Episodes
@@ -135,7 +136,8 @@ def train(config: TrainConfig, folder: Path, command: Command) -> None:
     with stoppable(lambda: how_to_go_on(folder, config.model)) as stop:
         from tdanet_jax.evaluation import episodes
         from tdanet_jax.io import files
-        from tdanet_jax.task import load_task, resolve, without_effect
+        from tdanet_jax.models.registry import unused_flags
+        from tdanet_jax.task import load_task, resolve
         from tdanet_jax.training import devices
         from tdanet_jax.training.run import Run
 
@@ -145,7 +147,7 @@ def train(config: TrainConfig, folder: Path, command: Command) -> None:
         with reporter("rooms", transient=True) as report_rooms:
             task = load_task(config, lambda done, total: report_rooms(done / total, "rebuilt"))
         lists = episodes.load(task.tables, task.split, task.extras)
-        for flag in without_effect(config, task.classes) if command.resume is None else ():
+        for flag in unused_flags(config, task.classes) if command.resume is None else ():
             console.print(f"note: {flag} changes nothing for {config.model}")
         # What `auto` means here is part of the run: it goes on with the same products elsewhere.
         config = resolve(config)
@@ -177,7 +179,7 @@ def prepare(folder: Path, config: TrainConfig, task: Task, resume: bool) -> None
 
 def trust(model: str) -> str:
     """The setting without which commands refuse a run's model; none for our own models."""
-    return "" if model in configs.MODELS else f"{configs.TRUST}={model}"
+    return "" if model in MODELS else f"{configs.TRUST}={model}"
 
 
 def how_to_go_on(folder: Path, model: str) -> str:

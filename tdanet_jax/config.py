@@ -12,30 +12,18 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tdanet_jax.io import files
+from tdanet_jax.models.registry import MODELS
+from tdanet_jax.observation_spec import SENSORS, ObservationSpec
 from tdanet_jax.vocabulary import file_name, make_split, split_name
 
-#: Models by name: the module that makes each, and the settings that it is made with.
-MODELS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "tdanet": ("tdanet_jax.models.tdanet", {}),
-    "tdanet-no-ta": ("tdanet_jax.models.tdanet", {"target_attention": False}),
-    "tdanet-no-sa": ("tdanet_jax.models.tdanet", {"siamese": False}),
-    "tdanet-no-ta-sa": ("tdanet_jax.models.tdanet", {"target_attention": False, "siamese": False}),
-    "ssnet": ("tdanet_jax.models.ssnet", {}),
-    "mjolnir-o": ("tdanet_jax.models.mjolnir", {}),
-    "mjolnir-r": ("tdanet_jax.models.mjolnir", {"image": True}),
-    "baseline": ("tdanet_jax.models.baseline", {}),
-    "sp": ("tdanet_jax.models.sp", {"width": 256}),
-    "sp-wide": ("tdanet_jax.models.sp", {"width": 1024}),
-    "savn": ("tdanet_jax.models.savn", {}),
-    "li": ("tdanet_jax.models.li", {}),
-}
 #: Budget in environment steps where none is given.
 DEFAULT_STEPS = 12_000_000
 #: What a run's budget can be given in; it ends when one of those given is spent.
 BUDGETS = ("steps", "episodes", "minutes")
 #: Name of the file in a run's folder that holds its configuration.
 CONFIG_FILE = "config.json"
-#: Environment variable: modules of models of one's own that runs on disk may name, with commas.
+#: Environment variable: comma-separated modules of custom models and sensors that a run's config
+#: may import.
 TRUST = "TDANET_TRUST"
 
 
@@ -102,11 +90,14 @@ class NetworkConfig:
     """What models that look at an image see: the classes of 7 x 7 cells, or the feature maps of
     ResNet-18 that were imported beside --data. auto: the maps where there are any."""
     odometry: bool = False
-    """Lets the agent sense its own way: the last action and whether it was blocked, where it is
-    relative to its start, and a map of where it has been. Beyond the paper; any model takes it."""
+    """Odometry: the last action and whether it was blocked, the pose relative to the start, and a
+    map of where the agent has been. Not in the paper; works with any model."""
     triangulation: bool = False
-    """Lets an agent with --odometry also sense where its target is, from the directions in which
-    its boxes were seen on the way. Beyond the paper; for models that see a box of every object."""
+    """Requires --odometry. Estimates the target's position from the bearings of its past
+    detections. Not in the paper; for models that are shown a box of every object."""
+    sensors: tuple[str, ...] = ()
+    """Further sensors: dotted names of modules of your own that have a function `make`
+    (docs/sensors.md)."""
     inner_rate: float = 1e-4
     """Size of the inner gradient steps of the models that adapt."""
     first_order: bool = False
@@ -115,6 +106,13 @@ class NetworkConfig:
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Operands of the large products; parameters and sums are always float32. auto: bfloat16 where
     the hardware multiplies it faster, on accelerators and on CPUs with AMX."""
+
+    @property
+    def spec(self) -> ObservationSpec:
+        """What the agent is shown, as far as the flags say it; the model may narrow it."""
+        flags = {"odometry": self.odometry, "triangulation": self.triangulation}
+        chosen = (*(name for name, on in flags.items() if on), *self.sensors)
+        return ObservationSpec(rows=self.rows, sensors=tuple(dict.fromkeys(chosen)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,10 +206,7 @@ class TrainConfig:
                 raise ValueError(f"{flag} {value}: must not be negative")
         if self.network.image == "features" and self.data is None:
             raise ValueError("--image features: needs --data, rooms that were imported with them")
-        if self.network.triangulation and not self.network.odometry:
-            raise ValueError("--triangulation: needs --odometry (or use --no-triangulation)")
-        if self.network.triangulation and self.network.rows != "object":
-            raise ValueError(f"--rows {self.network.rows}: --triangulation needs a row per object")
+        self.network.spec.check()
         if not 0 <= self.learner.size_noise <= 2:
             raise ValueError(f"--size-noise {self.learner.size_noise}: must be between 0 and 2")
         shares = {
@@ -270,6 +265,8 @@ def _fits(value: Any, kind: Any) -> bool:
     """Whether a value is of a field's type; numbers must be finite."""
     if get_origin(kind) is Literal:
         return value in get_args(kind)
+    if get_origin(kind) is tuple:
+        return isinstance(value, tuple) and all(_fits(one, get_args(kind)[0]) for one in value)
     if get_args(kind):
         return any(_fits(value, one) for one in get_args(kind))
     if kind is float:
@@ -319,7 +316,9 @@ def from_json(values: Mapping[str, Any]) -> TrainConfig:
             **{
                 **values,
                 "learner": LearnerConfig(**values["learner"]),
-                "network": NetworkConfig(**values["network"]),
+                "network": NetworkConfig(
+                    **{**values["network"], "sensors": tuple(values["network"].get("sensors", ()))}
+                ),
             }
         )
     except (KeyError, TypeError) as error:
@@ -337,18 +336,19 @@ def load(path: Path) -> TrainConfig:
     """Reads a run's `config.json`.
 
     Raises:
-      ValueError: the file is missing or unreadable, or names a model that is neither one of ours,
-        nor imported already, nor in `TDANET_TRUST`: making it would run its code. The message
-        names the file.
+      ValueError: the file is missing or unreadable, or names a model or sensor that is neither one
+        of ours, nor imported already, nor in `TDANET_TRUST`: making it would run its code. The
+        message names the file.
     """
     try:
         config = from_json(json.loads(path.read_text()))
-        trusted = (*MODELS, *sys.modules, *os.environ.get(TRUST, "").split(","))
-        if config.model not in trusted:
-            raise ValueError(
-                f"its model is code of somebody's own, {config.model}; "
-                f"if you trust it, set {TRUST}={config.model}"
-            )
+        trusted = (*MODELS, *SENSORS, *sys.modules, *os.environ.get(TRUST, "").split(","))
+        custom = {"model": (config.model,), "sensor": config.network.sensors}
+        for kind, names in custom.items():
+            for name in (name for name in names if name not in trusted):
+                raise ValueError(
+                    f"its {kind} is custom code, {name}; if you trust it, set {TRUST}={name}"
+                )
         return config
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; is this the folder of a run?") from None

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +11,7 @@ import numpy as np
 
 from tdanet_jax import poses
 from tdanet_jax import words as word_vectors
-from tdanet_jax.config import MODELS, NetworkConfig, TrainConfig
+from tdanet_jax.config import TrainConfig
 from tdanet_jax.env import dynamics, zero_shot
 from tdanet_jax.env.dynamics import TEST_STEP_LIMITS, EnvParams
 from tdanet_jax.env.reward import (
@@ -27,6 +25,7 @@ from tdanet_jax.env.reward import (
 from tdanet_jax.models import class_graph
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import Classes, make_classes
+from tdanet_jax.models.registry import make_model, resolve_precision
 from tdanet_jax.scenes.dataset import Extras, Rooms, load_rooms, with_own_rooms
 from tdanet_jax.scenes.offline import importer
 from tdanet_jax.scenes.tables import Progress, SceneTables
@@ -216,69 +215,3 @@ def resolve(config: TrainConfig) -> TrainConfig:
         imported = config.data is not None and importer.features_path(Path(config.data)).is_file()
         network = dataclasses.replace(network, image="features" if imported else "raster")
     return dataclasses.replace(config, network=network)
-
-
-def resolve_precision(config: NetworkConfig) -> NetworkConfig:
-    """The configuration with `auto` replaced by what suits this machine."""
-    if config.precision != "auto":
-        return config
-    cpuinfo = Path("/proc/cpuinfo")
-    on_cpu = jax.default_backend() == "cpu"
-    has_amx = on_cpu and cpuinfo.exists() and "amx_bf16" in cpuinfo.read_text()
-    fast = has_amx or not on_cpu
-    return dataclasses.replace(config, precision="bfloat16" if fast else "float32")
-
-
-def without_effect(config: TrainConfig, classes: Classes) -> list[str]:
-    """The flags of what it sees that are set and change nothing for this model, if it is ours."""
-    network, default = config.network, NetworkConfig()
-    if config.model not in MODELS:
-        return []
-    model = make_model(config, classes)
-    other_precision = {"float32": "bfloat16", "bfloat16": "float32"}
-
-    def idle(name: str) -> bool:
-        if name == "rows":
-            return model.encoder.ROWS is not None
-        if name == "image":
-            return not model.encoder.IMAGE
-        value: Any = getattr(network, name)
-        other: Any = other_precision[value] if name == "precision" else getattr(default, name)
-        values: dict[str, Any] = {name: other}
-        changed = dataclasses.replace(network, **values)
-        return model == make_model(dataclasses.replace(config, network=changed), classes)
-
-    names = [field.name for field in dataclasses.fields(network) if field.name != "word_norm"]
-    chosen = [name for name in names if getattr(network, name) != getattr(default, name)]
-    flags = [f"--{name.replace('_', '-')}" for name in chosen if idle(name)]
-    return [*flags, "--size-noise"] if config.learner.size_noise and model.encoder.IMAGE else flags
-
-
-def make_model(config: TrainConfig, classes: Classes) -> ActorCritic:
-    """The network of a configuration.
-
-    Raises:
-      ValueError: `config.model` names a module that cannot be imported or makes no `ActorCritic`,
-        or cannot triangulate.
-    """
-    module_name, options = MODELS.get(config.model, (config.model, {}))
-    try:
-        module = importlib.import_module(module_name)
-    except (ImportError, TypeError) as error:  # TypeError: a name that begins with a dot
-        raise ValueError(f"--model {config.model}: {error}") from None
-    if not hasattr(module, "make"):
-        raise ValueError(f"--model {config.model}: the module has no function `make`")
-    network = config.network
-    dtype = jnp.dtype(resolve_precision(network).precision)
-    model = module.make(network, classes, dtype, **options)
-    if not isinstance(model, ActorCritic):
-        raise ValueError(f"--model {config.model}: `make` gives no ActorCritic")
-    if network.triangulation and (model.encoder.IMAGE or model.encoder.ROWS == "class"):
-        raise ValueError(
-            f"--triangulation: {config.model} is not shown a box of every object; "
-            "use --no-triangulation"
-        )
-    return model.clone(
-        odometry=network.odometry or model.odometry,
-        triangulation=network.triangulation or model.triangulation,
-    )

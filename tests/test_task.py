@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tdanet_jax.config import MODELS, LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.models.registry import MODELS
 from tdanet_jax.env import dynamics
 from tdanet_jax.models.classes import Classes
 from tdanet_jax.scenes.offline import importer
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.task import make_model, make_task, resolve, without_effect
+from tdanet_jax.models.registry import make_model, unused_flags
+from tdanet_jax.task import make_task, resolve
 from tdanet_jax.words import WordVectors
 
 SMALL = NetworkConfig(width=8, hidden=4, precision="float32")
@@ -162,7 +164,7 @@ def test_feature_maps_need_imported_rooms() -> None:
 )
 def test_flags_that_change_nothing_are_named(model, network, idle) -> None:
     config = TrainConfig(model=model, network=network)
-    assert sorted(without_effect(config, Classes())) == sorted(idle)
+    assert sorted(unused_flags(config, Classes())) == sorted(idle)
 
 
 @pytest.mark.parametrize("model", ["tdanet", "ssnet", "baseline"])
@@ -171,4 +173,4 @@ def test_size_noise_changes_nothing_for_a_model_of_images(model: str) -> None:
     for noise in (0.0, 0.5):
         config = TrainConfig(model=model, network=network, learner=LearnerConfig(size_noise=noise))
         idle = ["--size-noise"] if noise and model == "baseline" else []
-        assert without_effect(config, Classes()) == idle
+        assert unused_flags(config, Classes()) == idle

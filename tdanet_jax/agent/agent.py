@@ -28,7 +28,7 @@ from tdanet_jax.models.layers import Carry
 from tdanet_jax.sensors import odometry
 from tdanet_jax.sensors.detections import centre_and_area, merge_classes
 from tdanet_jax.sensors.odometry import Trail
-from tdanet_jax.task import make_model
+from tdanet_jax.models.registry import make_model
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import newest
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action, class_words

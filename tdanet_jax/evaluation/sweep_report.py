@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tdanet_jax.config import MODELS
+from tdanet_jax.models.registry import MODELS
 from tdanet_jax.evaluation import comparison, paper
 from tdanet_jax.evaluation.comparison import Curve, Result, Spread
 from tdanet_jax.evaluation.sweep import Finished, evaluated_history, labels

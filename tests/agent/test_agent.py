@@ -19,7 +19,7 @@ from tdanet_jax.env.reward import find_parents
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.classes import Classes, make_classes
 from tdanet_jax.sensors import triangulation
-from tdanet_jax.task import make_model
+from tdanet_jax.models.registry import make_model
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
 from tdanet_jax.vocabulary import TARGETS, Action

@@ -9,7 +9,7 @@ import pytest
 from experiments import benchmark
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.models.classes import Classes
-from tdanet_jax.task import make_model
+from tdanet_jax.models.registry import make_model
 from tdanet_jax.tools import benchmarking
 from tests.agent.test_agent import OLD_RUN
 

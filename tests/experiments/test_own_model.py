@@ -13,7 +13,7 @@ from experiments import train_zero_shot
 from tdanet_jax.agent.agent import Detection
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.models.classes import Classes
-from tdanet_jax.task import make_model
+from tdanet_jax.models.registry import make_model
 from tests.support import command
 from tests.support.pages import block
 

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tdanet_jax.config import MODELS, LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.models.registry import MODELS
 from tdanet_jax.env.dynamics import Observation
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ODOMETRY_UNITS, ActorCritic
@@ -22,7 +23,8 @@ from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import TAPE, Linear
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.sensors.odometry import numbers
-from tdanet_jax.task import make_model, make_task
+from tdanet_jax.models.registry import make_model
+from tdanet_jax.task import make_task
 from tdanet_jax.training import learner
 from tdanet_jax.words import WordVectors
 from tests.support import samples

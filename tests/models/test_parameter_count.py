@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from tdanet_jax.config import MODELS, NetworkConfig, TrainConfig
+from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.models.registry import MODELS
 from tdanet_jax.models import parameter_count
 from tdanet_jax.models.classes import Classes
-from tdanet_jax.task import make_model
+from tdanet_jax.models.registry import make_model
 
 NAMES = tuple(f"Class{i}" for i in range(9))
 

@@ -21,7 +21,7 @@ from tdanet_jax.io import files
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import Classes
 from tdanet_jax.scenes import SceneTables
-from tdanet_jax.task import make_model
+from tdanet_jax.models.registry import make_model
 from tdanet_jax.training import checkpoint
 from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.training.learner import TrainState, init

@@ -13,7 +13,8 @@ import pytest
 from tdanet_jax import config as configs
 from tdanet_jax import words
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
-from tdanet_jax.task import make_model, make_task
+from tdanet_jax.models.registry import make_model
+from tdanet_jax.task import make_task
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.training.run import Run, chunks_together, read_metrics

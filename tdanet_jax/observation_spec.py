@@ -1,0 +1,54 @@
+"""What an agent is shown: one value that the environment, the network and a robot's agent share.
+
+Imports no JAX, so that a configuration can be checked before anything heavy is loaded.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Literal
+
+#: Sensors by name, and the module that makes each. A custom sensor goes by its module's dotted name.
+SENSORS: Mapping[str, str] = {
+    "odometry": "tdanet_jax.sensors.odometry",
+    "triangulation": "tdanet_jax.sensors.triangulation",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class ObservationSpec:
+    """What an agent is shown.
+
+    Attributes:
+      rows: one detection per "object", or per "class" (the extent over its instances).
+      image: the "raster" of classes in 7 x 7 cells, the imported "features" of ResNet-18, or None.
+      sensors: what it senses in addition to its detections, in the order of the network's inputs:
+        names of `SENSORS`, or dotted names of modules of custom sensors.
+    """
+
+    rows: Literal["object", "class"] = "object"
+    image: Literal["raster", "features"] | None = None
+    sensors: tuple[str, ...] = ()
+
+    def check(self, model: str | None = None) -> None:
+        """Raises ValueError, with one line that names the flag, if the parts do not go together.
+
+        Args:
+          model: the model that this is shown to, for the message.
+        """
+        for name in self.sensors:
+            if name not in SENSORS and "." not in name:
+                raise ValueError(
+                    f"--sensors {name}: choose among {', '.join(SENSORS)}, or name a module"
+                )
+        if "triangulation" in self.sensors:
+            before = self.sensors[: self.sensors.index("triangulation")]
+            if "odometry" not in before:
+                raise ValueError("--triangulation: needs --odometry (or use --no-triangulation)")
+            if self.rows != "object" or self.image is not None:
+                shown = f"--rows {self.rows}" if model is None else model
+                raise ValueError(
+                    f"--triangulation: needs a box of every object, which {shown} does not show; "
+                    "use --no-triangulation"
+                )
