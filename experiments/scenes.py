@@ -33,7 +33,7 @@ from experiments.console import (
     reporter,
 )
 from tdanet_jax.io import files
-from tdanet_jax.scenes.scene import GRID
+from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.vocabulary import (
     ALL_TARGETS,
     ROOM_TYPES,
@@ -453,7 +453,7 @@ def _start_ai2thor() -> Any:
         controller = importlib.import_module("ai2thor.controller")
     except ImportError:
         fail("collect needs AI2-THOR: pip install ai2thor")
-    return controller.Controller(gridSize=GRID, width=300, height=300, fieldOfView=90)
+    return controller.Controller(gridSize=GRID_SIZE, width=300, height=300, fieldOfView=90)
 
 
 COMMANDS: dict[str, Callable[..., Any]] = {

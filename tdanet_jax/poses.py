@@ -5,10 +5,17 @@ horizon 0 looks level, 1 looks 30 degrees down. Where nothing else depends on th
 call it a state.
 """
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
+import numpy as np
+
+GRID_SIZE = 0.25  # metres between neighbouring reachable points: AI2-THOR's gridSize
 ROTATIONS = 8
 HORIZONS = 2
+#: Grid cells (x, z) that MoveAhead moves along each rotation; both axes along a diagonal.
+STEPS = np.array([(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)])
 #: Poses at a position.
 VIEWS = ROTATIONS * HORIZONS
 

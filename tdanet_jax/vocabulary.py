@@ -27,6 +27,13 @@ class Action(IntEnum):
 ACTION_NAMES = ("MoveAhead", "RotateLeft", "RotateRight", "LookUp", "LookDown", "Done")
 NUM_ACTIONS = len(ACTION_NAMES)
 
+#: Settings of AI2-THOR that the task fixes.
+VISIBILITY_DISTANCE = 1.5  # metres, horizontal, within which it calls an object visible
+FIELD_OF_VIEW = 90.0  # degrees, horizontal and vertical
+IMAGE_SIZE = 300  # pixels, width and height of a frame
+#: The class that no room holds: it neither hides nor is looked for, and its box spans the room.
+IGNORED = "Floor"
+
 ROOM_TYPES = ("kitchen", "living_room", "bedroom", "bathroom")
 
 #: Scene numbers of each room type, in AI2-THOR's numbering; the first 20 train, the last 10 test.

@@ -15,21 +15,24 @@ from typing import Any, NamedTuple, Protocol
 import jax
 
 from tdanet_jax.agent.agent import Agent, Decision, Detection
-from tdanet_jax.poses import ROTATIONS
-from tdanet_jax.scenes.metadata import IGNORED
-from tdanet_jax.scenes.scene import GRID, REACH
-from tdanet_jax.scenes.tables import FIELD_OF_VIEW
-from tdanet_jax.scenes.visibility.build import IMAGE
-from tdanet_jax.scenes.visibility.geometry import STEPS
-from tdanet_jax.vocabulary import ACTION_NAMES, Action, class_words
+from tdanet_jax.poses import GRID_SIZE, ROTATIONS, STEPS
+from tdanet_jax.vocabulary import (
+    ACTION_NAMES,
+    FIELD_OF_VIEW,
+    IGNORED,
+    IMAGE_SIZE,
+    VISIBILITY_DISTANCE,
+    Action,
+    class_words,
+)
 
 #: Arguments of AI2-THOR's `Controller` that fit the rooms in which agents are trained.
 SETTINGS: dict[str, Any] = {
-    "width": IMAGE,
-    "height": IMAGE,
+    "width": IMAGE_SIZE,
+    "height": IMAGE_SIZE,
     "fieldOfView": FIELD_OF_VIEW,
-    "visibilityDistance": REACH,
-    "gridSize": GRID,
+    "visibilityDistance": VISIBILITY_DISTANCE,
+    "gridSize": GRID_SIZE,
     "rotateStepDegrees": 360 // ROTATIONS,
     "snapToGrid": False,  # AI2-THOR refuses to snap beside turns of 45 degrees
     "renderInstanceSegmentation": True,
@@ -201,7 +204,7 @@ def _take(
     ahead = action == Action.MOVE_AHEAD
     if not ahead and (turned, looking) == (heading, down):
         return event, before, False
-    dx, dz = (GRID * int(cells) for cells in STEPS[heading])
+    dx, dz = (GRID_SIZE * int(cells) for cells in STEPS[heading])
     arguments = {"moveMagnitude": math.hypot(dx, dz)} if ahead else {}
     event = controller.step(action=ACTION_NAMES[action], **arguments)
     moved = ahead and bool(event.metadata["lastActionSuccess"])

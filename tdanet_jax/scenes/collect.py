@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from tdanet_jax.io import files
+from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.scene import GRID
 
 FIELDS = (
     "objectId", "objectType", "axisAlignedBoundingBox", "objectOrientedBoundingBox", "rotation",
@@ -30,7 +30,7 @@ def collect(controller: Any, rooms: Iterable[tuple[str, str]]) -> list[dict[str,
     """
     documents = []
     for name, room_type in rooms:
-        start = controller.reset(scene=name, gridSize=GRID).metadata
+        start = controller.reset(scene=name, gridSize=GRID_SIZE).metadata
         event = controller.step(action="GetReachablePositions")
         if not event.metadata["lastActionSuccess"]:
             raise SceneError(f"{name}: GetReachablePositions: {event.metadata['errorMessage']}")

@@ -6,9 +6,10 @@ import dataclasses
 
 import numpy as np
 
+from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes import ithor
 from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.scene import GRID, Scene
+from tdanet_jax.scenes.scene import Scene
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.visibility.geometry import box_frame
 
@@ -56,7 +57,7 @@ def load(tables: SceneTables, name: str) -> FloorPlan:
     outlines, own = outlines[known], own[known]
     order = np.argsort([-area(outline) for outline in outlines], kind="stable")
     everything = np.concatenate([points, outlines.reshape(-1, 2)])
-    low, high = everything.min(axis=0) - GRID / 2, everything.max(axis=0) + GRID / 2
+    low, high = everything.min(axis=0) - GRID_SIZE / 2, everything.max(axis=0) + GRID_SIZE / 2
     return FloorPlan(
         name=name,
         points=points,

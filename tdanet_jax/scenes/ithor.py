@@ -17,11 +17,12 @@ import numpy as np
 
 from tdanet_jax.io import archive, assets
 from tdanet_jax.io.untrusted import npz
+from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.metadata import parse_scene
-from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, GRID, REACH, Scene, SceneObject
+from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene, SceneObject
 from tdanet_jax.scenes.visibility.geometry import box_frame, frustum_rotation, lattice
-from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
+from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS, VISIBILITY_DISTANCE
 
 ASSET = "ithor.npz"
 UNIT = 1e-4  # metres; the file holds whole numbers of tenths of a millimetre
@@ -90,9 +91,9 @@ def _whole(lengths: Any) -> np.ndarray:
 def _room(name: str, room_type: int, records: list[dict[str, Any]], layout: np.ndarray) -> Scene:
     """One room from its metadata and its reachable (x, z)."""
     agent = locate_agent(records)
-    grid = np.rint(layout / GRID) * GRID
+    grid = np.rint(layout / GRID_SIZE) * GRID_SIZE
     if len(grid) == 0 or np.abs(grid - layout).max() > 1e-3:
-        raise SceneError(f"{name}: reachable points are not on a {GRID} m grid")
+        raise SceneError(f"{name}: reachable points are not on a {GRID_SIZE} m grid")
     points = np.stack([grid[:, 0], np.full(len(grid), agent[1]), grid[:, 1]], axis=1)
     scene = parse_scene(name, room_type, records, points, agent)
     return dataclasses.replace(scene, default_rotation=_default_rotation(scene))
@@ -134,7 +135,7 @@ def _default_rotation(scene: Scene) -> int:
     origins, edges, visible = [], [], []
     for item in scene.objects:
         gap = np.maximum(np.maximum(item.box[0] - agent, agent - item.box[1]), 0)[[0, 2]]
-        if np.hypot(*gap) <= REACH or item.visible:
+        if np.hypot(*gap) <= VISIBILITY_DISTANCE or item.visible:
             origin, edge = box_frame(item.box, item.corners)
             origins.append(origin)
             edges.append(edge)

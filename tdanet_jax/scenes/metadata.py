@@ -24,11 +24,11 @@ from typing import Any
 
 import numpy as np
 
+from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.scene import GRID, Scene, SceneObject
-from tdanet_jax.vocabulary import PARTS, ROOM_TYPES
+from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.vocabulary import IGNORED, PARTS, ROOM_TYPES
 
-IGNORED = "Floor"  # neither hides nor is looked for; its box spans the room
 ALIGNED = 0.02  # metres by which a point may miss the grid
 FARTHEST = 1000.0  # metres from the origin; a coordinate beyond is a mistake
 
@@ -67,11 +67,13 @@ def check_points(name: str, points: np.ndarray) -> np.ndarray:
         raise SceneError(f"{name}: no reachable position")
     if not np.isfinite(points).all() or np.abs(points).max() > FARTHEST:
         raise SceneError(f"{name}: a reachable position is not finite or over {FARTHEST:.0f} m")
-    steps = (points - points[0])[:, [0, 2]] / GRID
-    off = np.abs(steps - np.rint(steps)).max(axis=1) * GRID
+    steps = (points - points[0])[:, [0, 2]] / GRID_SIZE
+    off = np.abs(steps - np.rint(steps)).max(axis=1) * GRID_SIZE
     if off.max() > ALIGNED:
         x, _, z = points[off.argmax()]
-        raise SceneError(f"{name}: reachable position x {x:.3f}, z {z:.3f}: off the {GRID} m grid")
+        raise SceneError(
+            f"{name}: reachable position x {x:.3f}, z {z:.3f}: off the {GRID_SIZE} m grid"
+        )
     _, first = np.unique(np.rint(steps), axis=0, return_index=True)
     return points[first]
 

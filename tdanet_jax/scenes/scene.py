@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 MOST_CLASSES = 127  # of the rooms together: the raster numbers them in int8
-GRID = 0.25  # metres between neighbouring reachable points
-REACH = 1.5  # metres, horizontal distance within which AI2-THOR calls an object visible
 CAMERA_ABOVE_AGENT = 0.675  # metres from the agent's y to its camera, AI2-THOR's default agent
 
 

@@ -22,13 +22,12 @@ from tdanet_jax.io.untrusted import npz
 from tdanet_jax.poses import VIEWS
 from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, MOST_CLASSES, Scene
-from tdanet_jax.scenes.visibility.build import IMAGE, SUBPIXEL, Sight, look_around
+from tdanet_jax.scenes.visibility.build import SUBPIXEL, Sight, look_around
 from tdanet_jax.scenes.visibility.geometry import action_distances, next_positions, transitions
 from tdanet_jax.scenes.visibility.raster import paint
 from tdanet_jax.scenes.visibility.rules import RULES, Rules
-from tdanet_jax.vocabulary import ALL_TARGETS
+from tdanet_jax.vocabulary import ALL_TARGETS, FIELD_OF_VIEW, IMAGE_SIZE
 
-FIELD_OF_VIEW = 90.0
 #: Rooms that are computed at once, where there are as many cores: 2 GB of memory.
 MOST_WORKERS = 8
 
@@ -59,7 +58,7 @@ class SceneTables:
     raster: np.ndarray  # [S, 7, 7] int8, class of the image cell (row, column), -1 none
     field_of_view: float = FIELD_OF_VIEW  # degrees, horizontal and vertical
     camera_height: float = CAMERA_ABOVE_AGENT  # metres above the agent's y
-    image: int = IMAGE  # pixels, width and height of the frame
+    image: int = IMAGE_SIZE  # pixels, width and height of the frame
     subpixel: int = SUBPIXEL  # units of row_box in a pixel
 
     @property
@@ -283,7 +282,9 @@ def tabulate(
         sight=sight,
         object_class=object_class,
         distance=action_distances(transitions(next_position), goals),
-        raster=paint(sight.state, sight.box, object_class[sight.owner], states, IMAGE * SUBPIXEL),
+        raster=paint(
+            sight.state, sight.box, object_class[sight.owner], states, IMAGE_SIZE * SUBPIXEL
+        ),
     )
 
 

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tdanet_jax import poses
 from tdanet_jax.io import assets
 from tdanet_jax.io.untrusted import npz
 from tdanet_jax.scenes import SceneError, ithor, metadata
-from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, REACH
+from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT
 from tdanet_jax.scenes.visibility import geometry
 from tdanet_jax.tools import build_assets
-from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
+from tdanet_jax.vocabulary import IGNORED, ROOM_TYPES, SCENE_NUMBERS, VISIBILITY_DISTANCE
 
 WHEELS = os.environ.get("TDANET_WHEELS")  # folder with the wheels of bundle.SOURCES
 needs_wheels = pytest.mark.skipif(not WHEELS, reason="TDANET_WHEELS names no folder of wheels")
@@ -134,7 +135,7 @@ def test_flagged_objects_lie_in_the_default_view() -> None:
     for scene in ithor.load_scenes():
         assert scene.default_rotation is not None
         assert scene.default_position is not None
-        x, z = geometry.STEPS[scene.default_rotation // 45]
+        x, z = poses.STEPS[scene.default_rotation // 45]
         for item in scene.objects:
             if item.visible:
                 origin, edges = geometry.box_frame(item.box, item.corners)
@@ -146,7 +147,7 @@ def test_flagged_objects_lie_in_the_default_view() -> None:
                 up = points[:, 1] - CAMERA_ABOVE_AGENT
                 inside += bool(((np.abs(side) < depth) & (np.abs(up) < depth)).any())
                 flagged += 1
-                assert np.hypot(points[:, 0], points[:, 2]).min() < REACH + 0.2
+                assert np.hypot(points[:, 0], points[:, 2]).min() < VISIBILITY_DISTANCE + 0.2
     assert flagged > 500
     assert inside >= 0.98 * flagged
 
@@ -173,5 +174,5 @@ def test_robothor_objects_parse() -> None:
     spots = np.array([(0.0, 0.9, 0.0)])
     for i, records in enumerate(content):
         scene = metadata.parse_scene(f"RoboTHOR{i}", 1, records, spots)
-        kept = [r for r in records if r["objectType"] != metadata.IGNORED]
+        kept = [r for r in records if r["objectType"] != IGNORED]
         assert len(scene.objects) == len(kept)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from tdanet_jax.scenes.scene import GRID, Scene, SceneObject
+from tdanet_jax.poses import GRID_SIZE
+from tdanet_jax.scenes.scene import Scene, SceneObject
 
 AGENT = 0.9  # metres, y of an agent that stands on a floor at 0
 CAMERA = 1.575  # metres, y of its camera
@@ -16,7 +17,7 @@ def points(*spots: tuple[float, float]) -> np.ndarray:
 
 def line(count: int) -> np.ndarray:
     """Reachable points in a row from the origin along +z."""
-    return points(*((0.0, GRID * i) for i in range(count)))
+    return points(*((0.0, GRID_SIZE * i) for i in range(count)))
 
 
 def thing(
@@ -67,4 +68,4 @@ def random_room(draw: np.random.Generator, name: str = "Random") -> Scene:
                 bool(draw.random() < 0.3),
             )
         )
-    return room(points(*(kept * GRID)), *objects, name=name, room_type=int(draw.integers(4)))
+    return room(points(*(kept * GRID_SIZE)), *objects, name=name, room_type=int(draw.integers(4)))

@@ -12,11 +12,12 @@ import numpy as np
 
 from tdanet_jax import poses
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene
-from tdanet_jax.scenes.visibility.build import IMAGE, SUBPIXEL, look_around
+from tdanet_jax.scenes.visibility.build import SUBPIXEL, look_around
 from tdanet_jax.scenes.visibility.geometry import box_frame
 from tdanet_jax.scenes.visibility.rays import CLOSED, TURN_BITS
 from tdanet_jax.scenes.visibility.rules import Rules
 from tdanet_jax.scenes.visibility.solids import fronts_of, solids_of, stood_on
+from tdanet_jax.vocabulary import IMAGE_SIZE
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def dense_view(scene: Scene, rules: Rules, state: int, pixels: int = 150) -> Den
         share[k] = len(rows) / len(rays)
         if len(rows):
             y, x = np.divmod(rows, pixels)
-            step = IMAGE / pixels
+            step = IMAGE_SIZE / pixels
             box[k] = np.array([x.min(), y.min(), x.max() + 1, y.max() + 1]) * step
     return DenseView(box, share)
 

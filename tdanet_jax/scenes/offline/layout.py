@@ -8,8 +8,8 @@ import numpy as np
 
 from tdanet_jax import poses
 from tdanet_jax.io.untrusted import FileError
+from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes.metadata import ALIGNED
-from tdanet_jax.scenes.scene import GRID
 from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
 
 GRID_FILE, GRAPH_FILE, BOX_FILE = "grid.json", "graph.json", "objects_bb.json"
@@ -63,7 +63,7 @@ class Grid:
     def __init__(self, points: np.ndarray) -> None:
         self.points = points  # [P, 3] metres
         self._origin = points[0, [0, 2]]
-        cells = np.rint((points[:, [0, 2]] - self._origin) / GRID).astype(np.int64)
+        cells = np.rint((points[:, [0, 2]] - self._origin) / GRID_SIZE).astype(np.int64)
         self._index = {(int(x), int(z)): i for i, (x, z) in enumerate(cells)}
         self._known: dict[str, int] = {}
 
@@ -94,10 +94,10 @@ class Grid:
         key = state_key(x, z, rotation, horizon)
         if rotation % 45 or not 0 <= rotation < 360 or horizon not in (0, 30):
             raise FileError(path, f"state {key}: rotation or horizon is not one of the task's")
-        steps = (np.array([x, z]) - self._origin) / GRID
+        steps = (np.array([x, z]) - self._origin) / GRID_SIZE
         cell = np.rint(steps)
         point = self._index.get((int(cell[0]), int(cell[1])))
-        if point is None or np.abs(steps - cell).max() * GRID > ALIGNED:
+        if point is None or np.abs(steps - cell).max() * GRID_SIZE > ALIGNED:
             raise FileError(path, f"state {key} is not on the grid of grid.json")
         return poses.from_degrees(point, rotation, horizon)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from tdanet_jax import poses
 from tdanet_jax.io.untrusted import FileError, jsons
-from tdanet_jax.poses import HORIZONS, ROTATIONS, VIEWS
+from tdanet_jax.poses import GRID_SIZE, HORIZONS, ROTATIONS, STEPS, VIEWS
 from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.metadata import FARTHEST, check_points
 from tdanet_jax.scenes.offline.layout import (
@@ -24,9 +24,10 @@ from tdanet_jax.scenes.offline.layout import (
     Grid,
     first_file,
 )
-from tdanet_jax.scenes.scene import GRID, Scene, SceneObject
-from tdanet_jax.scenes.visibility.build import IMAGE, SUBPIXEL, Sight
-from tdanet_jax.scenes.visibility.geometry import STEPS, transitions
+from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.scenes.visibility.build import SUBPIXEL, Sight
+from tdanet_jax.scenes.visibility.geometry import transitions
+from tdanet_jax.vocabulary import IMAGE_SIZE
 
 #: The box of an object that is known to be visible, but not where.
 NO_BOX = (-1, -1, -1, -1)
@@ -150,7 +151,7 @@ def _steps(grid: Grid, pairs: np.ndarray, nodes: set[int]) -> tuple[np.ndarray, 
     count = len(grid.points)
     source, target = pairs.T
     (place, heading, horizon), end = poses.split(source), poses.split(target)
-    moved = (grid.points[end.position] - grid.points[place])[:, [0, 2]] / GRID
+    moved = (grid.points[end.position] - grid.points[place])[:, [0, 2]] / GRID_SIZE
     straight = (heading == end.rotation) & (horizon == end.horizon) & (source != target)
     step = straight & (np.abs(moved - STEPS[heading]).max(axis=1, initial=0) < 0.5)
     result = np.repeat(np.arange(count, dtype=np.int32)[:, None], ROTATIONS, axis=1)
@@ -297,10 +298,10 @@ def _boxes(path: Path, key: str, name: str, flat: Any) -> np.ndarray:
     if not all(type(value) in (int, float) for value in flat):
         raise FileError(path, f"{where}: a pixel that is no number")
     pixels = np.array([min(max(value, -1e6), 1e6) for value in flat], np.float64).reshape(-1, 4)
-    inside = (pixels >= -OVERHANG) & (pixels <= IMAGE + OVERHANG)  # False for NaN
+    inside = (pixels >= -OVERHANG) & (pixels <= IMAGE_SIZE + OVERHANG)  # False for NaN
     if not inside.all():
         raise FileError(path, f"{where}: a pixel that is not finite or not in the image")
-    pixels = np.clip(pixels, 0, IMAGE)
+    pixels = np.clip(pixels, 0, IMAGE_SIZE)
     corners = np.hstack([np.minimum(pixels[:, :2], pixels[:, 2:]),
                          np.maximum(pixels[:, :2], pixels[:, 2:])])  # fmt: skip
     return np.rint(corners * SUBPIXEL).astype(np.int16)

@@ -17,8 +17,8 @@ from tdanet_jax.scenes.visibility import rays
 from tdanet_jax.scenes.visibility.geometry import box_frame
 from tdanet_jax.scenes.visibility.rules import Rules
 from tdanet_jax.scenes.visibility.solids import THIN, Patches, millimetres, patches_of, solids_of
+from tdanet_jax.vocabulary import IMAGE_SIZE
 
-IMAGE = 300  # pixels, width and height of the frame
 SUBPIXEL = 16  # boxes are stored in sixteenths of a pixel
 
 
@@ -60,7 +60,7 @@ def project(across: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
     Points behind the camera land far outside the image, on their side of it.
     """
-    return across * (np.float32(IMAGE * SUBPIXEL / 2) / np.maximum(depth, np.float32(1)))
+    return across * (np.float32(IMAGE_SIZE * SUBPIXEL / 2) / np.maximum(depth, np.float32(1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,5 +188,5 @@ def _extents(
         op.reduceat(op(op(a[:, 0], a[:, 1]), op(a[:, 2], a[:, 3])), start)
         for op, a in ((np.minimum, x), (np.minimum, y), (np.maximum, x), (np.maximum, y))
     ]
-    middle = IMAGE * SUBPIXEL // 2
+    middle = IMAGE_SIZE * SUBPIXEL // 2
     return np.rint(np.clip(np.stack(sides, axis=1), -middle, middle)).astype(np.int16) + middle

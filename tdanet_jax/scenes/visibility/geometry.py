@@ -7,11 +7,7 @@ World axes are AI2-THOR's: x right, y up, z forward, left-handed; metres. Headin
 import numpy as np
 
 from tdanet_jax import poses
-from tdanet_jax.poses import HORIZONS, ROTATIONS
-from tdanet_jax.scenes.scene import GRID
-
-# Grid steps of MoveAhead along each heading; a diagonal one moves a step on both axes.
-STEPS = np.array([(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)])
+from tdanet_jax.poses import GRID_SIZE, HORIZONS, ROTATIONS, STEPS
 
 
 def box_frame(box: np.ndarray, corners: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -31,7 +27,7 @@ def next_positions(points: np.ndarray) -> np.ndarray:
 
     A step to a place that is not reachable leaves the agent where it is.
     """
-    cells = np.rint((points - points[0])[:, [0, 2]] / GRID).astype(np.int64)
+    cells = np.rint((points - points[0])[:, [0, 2]] / GRID_SIZE).astype(np.int64)
     index = {(int(x), int(z)): i for i, (x, z) in enumerate(cells)}
     result = np.empty((len(points), ROTATIONS), np.int32)
     for i, (x, z) in enumerate(cells):
