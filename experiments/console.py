@@ -32,7 +32,7 @@ from rich.text import Text
 
 import experiments
 from tdanet_jax.io.files import LOCK_FILE, PARTIAL
-from tdanet_jax.vocabulary import GROUPS
+from tdanet_jax.splits import GROUPS
 
 Arguments = TypeVar("Arguments")
 

@@ -34,13 +34,8 @@ from experiments.console import (
 )
 from tdanet_jax.io import files
 from tdanet_jax.poses import GRID_SIZE
-from tdanet_jax.vocabulary import (
-    ALL_TARGETS,
-    ROOM_TYPES,
-    TARGETS,
-    TRAIN_SCENES_PER_TYPE,
-    make_split,
-)
+from tdanet_jax.splits import TRAIN_SCENES_PER_TYPE, make_split
+from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TARGETS
 
 if TYPE_CHECKING:
     from tdanet_jax.scenes import SceneTables, dataset

@@ -37,7 +37,7 @@ from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
 from tdanet_jax.evaluation import sweep, sweep_report
 from tdanet_jax.evaluation.sweep import Finished
 from tdanet_jax.evaluation.sweep_report import Cost
-from tdanet_jax.vocabulary import file_name
+from tdanet_jax.splits import file_name
 
 if TYPE_CHECKING:
     from tdanet_jax.training.run import Run

@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from tdanet_jax.io import files
 from tdanet_jax.models.registry import MODELS
 from tdanet_jax.observation_spec import SENSORS, ObservationSpec
-from tdanet_jax.vocabulary import file_name, make_split, split_name
+from tdanet_jax.splits import file_name, make_split, split_name
 
 #: Budget in environment steps where none is given.
 DEFAULT_STEPS = 12_000_000

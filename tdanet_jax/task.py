@@ -29,7 +29,8 @@ from tdanet_jax.models.registry import make_model, resolve_precision
 from tdanet_jax.scenes.dataset import Extras, Rooms, load_rooms, with_own_rooms
 from tdanet_jax.scenes.offline import importer
 from tdanet_jax.scenes.tables import Progress, SceneTables
-from tdanet_jax.vocabulary import ROOM_TYPES, Split, make_split
+from tdanet_jax.splits import Split, make_split
+from tdanet_jax.vocabulary import ROOM_TYPES
 from tdanet_jax.words import WordVectors
 
 

@@ -1,15 +1,11 @@
-"""Room types, actions, target classes and zero-shot splits: the words of the task.
+"""Actions, room types and target classes: the words of the task.
 
-Sources: actions, rooms, targets and splits as in MJOLNIR (Qiu et al. 2020), SSNet (Zhao et al.
-2023) and TDANet (Lian and Zhang 2024).
+Sources: as in MJOLNIR (Qiu et al. 2020), SSNet (Zhao et al. 2023) and TDANet (Lian and Zhang 2024).
 """
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
 import re
-from collections.abc import Collection
 from enum import IntEnum
 
 
@@ -36,20 +32,6 @@ IGNORED = "Floor"
 
 ROOM_TYPES = ("kitchen", "living_room", "bedroom", "bathroom")
 
-#: Scene numbers of each room type, in AI2-THOR's numbering; the first 20 train, the last 10 test.
-SCENE_NUMBERS = {
-    "kitchen": range(1, 31),
-    "living_room": range(201, 231),
-    "bedroom": range(301, 331),
-    "bathroom": range(401, 431),
-}
-TRAIN_SCENES_PER_TYPE = 20
-#: `--validation` trains on the first 16 training rooms of a type and evaluates on the last 4.
-VALIDATION_TRAIN_SCENES_PER_TYPE = 16
-
-#: What rooms are for.
-PARTS = ("train", "test")
-
 #: The 22 target classes by room type.
 TARGETS: dict[str, tuple[str, ...]] = {
     "kitchen": ("Toaster", "Spatula", "Bread", "Mug", "CoffeeMachine", "Apple"),
@@ -58,182 +40,6 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "bathroom": ("Mirror", "ToiletPaper", "SoapBar", "Towel", "SprayBottle"),
 }
 ALL_TARGETS = tuple(name for room in ROOM_TYPES for name in TARGETS[room])
-
-#: Groups of test episodes by their target: classes that training had as targets, and the others.
-GROUPS = ("seen", "unseen")
-#: Classes that are never a target in training, by split (seen/unseen) and room type.
-UNSEEN: dict[str, dict[str, tuple[str, ...]]] = {
-    "22/0": dict.fromkeys(ROOM_TYPES, ()),
-    "18/4": {
-        "kitchen": ("Toaster",),
-        "living_room": ("Laptop",),
-        "bedroom": ("Pillow",),
-        "bathroom": ("ToiletPaper",),
-    },
-    "14/8": {
-        "kitchen": ("Apple", "Toaster"),
-        "living_room": ("Television", "Laptop"),
-        "bedroom": ("AlarmClock", "Pillow"),
-        "bathroom": ("ToiletPaper", "Mirror"),
-    },
-}
-#: One more seen class per room type, held out by `--validation` to stand for the unseen ones; where
-#: a split hides it already, the room type's first class that is left takes its place.
-VALIDATION_UNSEEN = {
-    "kitchen": ("Bread",),
-    "living_room": ("RemoteControl",),
-    "bedroom": ("DeskLamp",),
-    "bathroom": ("SoapBar",),
-}
-
-
-@dataclasses.dataclass(frozen=True)
-class Split:
-    """Which rooms and target classes train, and which are evaluated as seen and as unseen.
-
-    Attributes:
-      name: "18/4", "Mug,Vase", or "18/4-validation".
-      train_scenes, eval_scenes: scene names such as "FloorPlan1".
-      hidden: classes of which nothing reaches the learner.
-      seen: room type -> target classes that train.
-      unseen: room type -> target classes evaluated as never trained on; a subset of `hidden`.
-    """
-
-    name: str
-    train_scenes: tuple[str, ...]
-    eval_scenes: tuple[str, ...]
-    hidden: frozenset[str]
-    seen: dict[str, tuple[str, ...]]
-    unseen: dict[str, tuple[str, ...]]
-
-    def within(self, scenes: Collection[str], classes: Collection[str]) -> Split:
-        """What is left of the split in a world of these scenes and classes.
-
-        Raises:
-          ValueError: no room to train or to evaluate in is left.
-        """
-        train = tuple(name for name in self.train_scenes if name in scenes)
-        evaluated = tuple(name for name in self.eval_scenes if name in scenes)
-        for title, left in (("training", train), ("evaluation", evaluated)):
-            if not left:
-                raise ValueError(
-                    f"none of the {title} rooms of split {self.name} (by iTHOR's names, or by "
-                    f'"split" in a scene file) is among the {len(scenes)} rooms'
-                )
-
-        def present(targets: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-            return {
-                room: tuple(c for c in names if c in classes) for room, names in targets.items()
-            }
-
-        return dataclasses.replace(
-            self,
-            train_scenes=train,
-            eval_scenes=evaluated,
-            hidden=frozenset(self.hidden & set(classes)),
-            seen=present(self.seen),
-            unseen=present(self.unseen),
-        )
-
-
-def scene_name(number: int) -> str:
-    """AI2-THOR's name of a scene: FloorPlan228."""
-    return f"FloorPlan{number}"
-
-
-def make_split(text: str, validation: bool = False) -> Split:
-    """The split that is called so, or that leaves these classes out (`split_name`).
-
-    With `validation`, the test rooms and the unseen classes are not touched: the last 4 training
-    rooms of each type are evaluated, and one seen class per type is held out beside the unseen.
-
-    Raises:
-      ValueError: `text` means no split, or one without a class to train on in some room type.
-    """
-    name = split_name(text)
-    missing = unseen_classes(name)
-    first = VALIDATION_TRAIN_SCENES_PER_TYPE if validation else TRAIN_SCENES_PER_TYPE
-    last = TRAIN_SCENES_PER_TYPE if validation else None
-    train, evaluated = [], []
-    for room in ROOM_TYPES:
-        names = [scene_name(n) for n in SCENE_NUMBERS[room]]
-        train += names[:first]
-        evaluated += names[first:last]
-    unseen = {r: _held_out(r, missing[r]) for r in ROOM_TYPES} if validation else missing
-    hidden = {c for room in ROOM_TYPES for c in (*missing[room], *unseen[room])}
-    seen = {room: tuple(c for c in TARGETS[room] if c not in hidden) for room in ROOM_TYPES}
-    if empty := [room for room in ROOM_TYPES if not seen[room]]:
-        beside = " beside the one that --validation holds out" if validation else ""
-        raise ValueError(
-            f"--split {text}: leaves no class to train on in {', '.join(empty)}{beside}"
-        )
-    return Split(
-        name=f"{name}-validation" if validation else name,
-        train_scenes=tuple(train),
-        eval_scenes=tuple(evaluated),
-        hidden=frozenset(hidden),
-        seen=seen,
-        unseen=dict(unseen),
-    )
-
-
-def split_name(text: str) -> str:
-    """The one name of the split that a text means.
-
-    Args:
-      text: "22/0", "18/4" or "14/8"; or the unseen classes in any order, separated by commas:
-        "vase,Mug" is "Mug,Vase", and the four classes of 18/4 are "18/4".
-
-    Raises:
-      ValueError: it means none; the message names what is wrong with it.
-    """
-    if text in UNSEEN:
-        return text
-    named = [_target_class(word, text) for word in text.split(",")]
-    if twice := [name for name in ALL_TARGETS if named.count(name) > 1]:
-        raise ValueError(f"--split {text}: {twice[0]} is given twice")
-    for name, classes in UNSEEN.items():
-        if set(named) == {c for room in ROOM_TYPES for c in classes[room]}:
-            return name
-    return ",".join(name for name in ALL_TARGETS if name in named)
-
-
-def unseen_classes(name: str) -> dict[str, tuple[str, ...]]:
-    """Room type -> classes that a split leaves out of training, from its name (`split_name`)."""
-    if name in UNSEEN:
-        return UNSEEN[name]
-    named = name.split(",")
-    return {room: tuple(c for c in TARGETS[room] if c in named) for room in ROOM_TYPES}
-
-
-def file_name(split: str) -> str:
-    """A split's name as part of a file's: 18-4, Mug-Vase-validation."""
-    return split.replace("/", "-").replace(",", "-")
-
-
-def _target_class(word: str, text: str) -> str:
-    """The target class that a word of `text` names, whatever its capitals, spaces and hyphens."""
-    keys = {"".join(class_words(name)): name for name in ALL_TARGETS}
-    key = "".join(class_words(word))
-    if key in keys:
-        return keys[key]
-    if not key and "," in text:
-        raise ValueError(f"--split {text}: a comma without a class on both sides")
-    if near := difflib.get_close_matches(key, keys, n=1):
-        raise ValueError(
-            f"--split {text}: no target is called {word}; did you mean {keys[near[0]]}?"
-        )
-    problem = "" if word == text else f"no target is called {word}; "
-    raise ValueError(
-        f"--split {text}: {problem}choose one of {', '.join(UNSEEN)}, or name the unseen classes, "
-        f"separated by commas, among {', '.join(ALL_TARGETS)}"
-    )
-
-
-def _held_out(room: str, missing: Collection[str]) -> tuple[str, ...]:
-    """The class of a room type that validation holds out of those that a split has not hidden."""
-    order = (*VALIDATION_UNSEEN[room], *TARGETS[room])
-    return tuple(name for name in order if name not in missing)[:1]
 
 
 def class_words(name: str) -> tuple[str, ...]:

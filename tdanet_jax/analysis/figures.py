@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter
 
 from tdanet_jax.evaluation.comparison import MEASURES, Curve
 from tdanet_jax.io import files
-from tdanet_jax.vocabulary import GROUPS
+from tdanet_jax.splits import GROUPS
 
 #: Colours (Okabe and Ito) that stay apart for the colour-blind and, with the dashes, in grey.
 BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"

@@ -16,7 +16,8 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.vocabulary import ROOM_TYPES, make_split
+from tdanet_jax.splits import make_split
+from tdanet_jax.vocabulary import ROOM_TYPES
 
 #: Reward of any step that earns nothing else, a failed Done included.
 STEP_REWARD = -0.01

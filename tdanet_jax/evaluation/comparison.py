@@ -17,7 +17,7 @@ import numpy as np
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.evaluation import metrics, paper
 from tdanet_jax.evaluation.metrics import BUCKETS
-from tdanet_jax.vocabulary import GROUPS
+from tdanet_jax.splits import GROUPS
 
 Result = Mapping[str, Any]
 #: The records of a network by group, as the columns of `report.columns`.

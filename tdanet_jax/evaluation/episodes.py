@@ -12,7 +12,8 @@ from tdanet_jax import poses
 from tdanet_jax.io import assets
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.vocabulary import GROUPS, ROOM_TYPES, UNSEEN, Split, make_split
+from tdanet_jax.splits import GROUPS, UNSEEN, Split, make_split
+from tdanet_jax.vocabulary import ROOM_TYPES
 
 ASSET = "episodes.npz"
 EPISODES_PER_ROOM_TYPE = 250

@@ -20,7 +20,8 @@ from tdanet_jax.evaluation.metrics import BUCKETS, grouped, shown, summarise
 from tdanet_jax.evaluation.rollout import Records
 from tdanet_jax.io import files
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS, GROUPS, ROOM_TYPES
+from tdanet_jax.splits import GROUPS
+from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS, ROOM_TYPES
 
 RESULTS_VERSION = 1
 #: What an evaluation writes into its folder; `RESULTS_FILE` comes last.

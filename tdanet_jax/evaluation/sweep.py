@@ -18,7 +18,7 @@ from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.evaluation import comparison
 from tdanet_jax.evaluation.comparison import Result
 from tdanet_jax.io import files
-from tdanet_jax.vocabulary import split_name
+from tdanet_jax.splits import split_name
 
 #: Where the evaluated histories of a sweep's runs are kept.
 HISTORIES = "histories"

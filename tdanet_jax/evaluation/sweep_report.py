@@ -7,11 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tdanet_jax.models.registry import MODELS
 from tdanet_jax.evaluation import comparison, paper
 from tdanet_jax.evaluation.comparison import Curve, Result, Spread
 from tdanet_jax.evaluation.sweep import Finished, evaluated_history, labels
-from tdanet_jax.vocabulary import UNSEEN
+from tdanet_jax.models.registry import MODELS
+from tdanet_jax.splits import UNSEEN
 
 REPORT_VERSION = 1
 #: The splits of the paper's tables.

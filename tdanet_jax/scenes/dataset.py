@@ -15,13 +15,8 @@ from tdanet_jax.io.untrusted import FileError, npz
 from tdanet_jax.scenes import cache
 from tdanet_jax.scenes.scene import MOST_CLASSES, Scene, SceneObject
 from tdanet_jax.scenes.tables import Progress, SceneTables
-from tdanet_jax.vocabulary import (
-    PARTS,
-    ROOM_TYPES,
-    TRAIN_SCENES_PER_TYPE,
-    VALIDATION_TRAIN_SCENES_PER_TYPE,
-    Split,
-)
+from tdanet_jax.splits import PARTS, TRAIN_SCENES_PER_TYPE, VALIDATION_TRAIN_SCENES_PER_TYPE, Split
+from tdanet_jax.vocabulary import ROOM_TYPES
 
 
 @dataclasses.dataclass(frozen=True)

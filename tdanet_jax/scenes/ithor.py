@@ -22,7 +22,8 @@ from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.metadata import parse_scene
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene, SceneObject
 from tdanet_jax.scenes.visibility.geometry import box_frame, frustum_rotation, lattice
-from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS, VISIBILITY_DISTANCE
+from tdanet_jax.splits import SCENE_NUMBERS
+from tdanet_jax.vocabulary import ROOM_TYPES, VISIBILITY_DISTANCE
 
 ASSET = "ithor.npz"
 UNIT = 1e-4  # metres; the file holds whole numbers of tenths of a millimetre

@@ -27,7 +27,8 @@ import numpy as np
 from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.scene import Scene, SceneObject
-from tdanet_jax.vocabulary import IGNORED, PARTS, ROOM_TYPES
+from tdanet_jax.splits import PARTS
+from tdanet_jax.vocabulary import IGNORED, ROOM_TYPES
 
 ALIGNED = 0.02  # metres by which a point may miss the grid
 FARTHEST = 1000.0  # metres from the origin; a coordinate beyond is a mistake

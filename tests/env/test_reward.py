@@ -14,8 +14,9 @@ from tdanet_jax.env import dynamics, reward
 from tdanet_jax.env.dynamics import EnvState
 from tdanet_jax.env.reward import Parents, find_parents
 from tdanet_jax.scenes import SceneTables
+from tdanet_jax.splits import make_split
 from tdanet_jax.task import make_task
-from tdanet_jax.vocabulary import TARGETS, make_split
+from tdanet_jax.vocabulary import TARGETS
 from tdanet_jax.words import WordVectors
 from tests.support import handmade, oracle
 from tests.support.handmade import Room, Sighting, corridor, tables_of

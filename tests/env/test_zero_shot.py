@@ -19,9 +19,10 @@ import pytest
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.env import dynamics, zero_shot
 from tdanet_jax.scenes import SceneTables
+from tdanet_jax.splits import Split, make_split
 from tdanet_jax.task import make_task
 from tdanet_jax.training import learner
-from tdanet_jax.vocabulary import ROOM_TYPES, Split, class_words, make_split
+from tdanet_jax.vocabulary import ROOM_TYPES, class_words
 from tdanet_jax.words import WordVectors
 from tests.support.handmade import FRAME
 

@@ -12,7 +12,8 @@ from scipy import stats
 
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.scenes import SceneTables
-from tdanet_jax.vocabulary import TARGETS, UNSEEN, make_split
+from tdanet_jax.splits import UNSEEN, make_split
+from tdanet_jax.vocabulary import TARGETS
 from tests.support.handmade import lopsided
 from tests.support.oracle import ROOMS, World, pose_of
 

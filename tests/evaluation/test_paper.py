@@ -4,7 +4,7 @@ from pathlib import Path
 
 from tdanet_jax.evaluation import paper
 from tdanet_jax.evaluation.metrics import BUCKETS
-from tdanet_jax.vocabulary import UNSEEN
+from tdanet_jax.splits import UNSEEN
 
 
 def test_rates_are_percentages_of_known_splits_groups_and_buckets():

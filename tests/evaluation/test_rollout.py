@@ -23,7 +23,8 @@ from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.tdanet import TDANetEncoder
 from tdanet_jax.scenes import SceneTables
-from tdanet_jax.vocabulary import TARGETS, Action, make_split
+from tdanet_jax.splits import make_split
+from tdanet_jax.vocabulary import TARGETS, Action
 from tests.support import oracle, samples
 from tests.support.handmade import random_tables
 from tests.support.oracle import ROOMS, Episode, World, pose_of

@@ -14,7 +14,7 @@ from tdanet_jax.io import archive
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes import SceneTables, dataset, tables
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode, Rooms
-from tdanet_jax.vocabulary import make_split
+from tdanet_jax.splits import make_split
 from tests.support import toy
 
 

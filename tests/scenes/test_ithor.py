@@ -16,8 +16,9 @@ from tdanet_jax.io.untrusted import npz
 from tdanet_jax.scenes import SceneError, ithor, metadata
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT
 from tdanet_jax.scenes.visibility import geometry
+from tdanet_jax.splits import SCENE_NUMBERS
 from tdanet_jax.tools import build_assets
-from tdanet_jax.vocabulary import IGNORED, ROOM_TYPES, SCENE_NUMBERS, VISIBILITY_DISTANCE
+from tdanet_jax.vocabulary import IGNORED, ROOM_TYPES, VISIBILITY_DISTANCE
 
 WHEELS = os.environ.get("TDANET_WHEELS")  # folder with the wheels of bundle.SOURCES
 needs_wheels = pytest.mark.skipif(not WHEELS, reason="TDANET_WHEELS names no folder of wheels")

@@ -10,7 +10,8 @@ from tdanet_jax import poses
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes.metadata import ALIGNED
-from tdanet_jax.vocabulary import ROOM_TYPES, SCENE_NUMBERS
+from tdanet_jax.splits import SCENE_NUMBERS
+from tdanet_jax.vocabulary import ROOM_TYPES
 
 GRID_FILE, GRAPH_FILE, BOX_FILE = "grid.json", "graph.json", "objects_bb.json"
 #: Both names of the visibility map, the one that says its distance first; then the raw metadata.

@@ -19,7 +19,8 @@ from tdanet_jax.io.untrusted import FileError, hdf5
 from tdanet_jax.scenes import SceneTables, dataset, tables
 from tdanet_jax.scenes.offline import exporter, importer, reader
 from tdanet_jax.scenes.offline.layout import OBJECT_FILE, state_keys
-from tdanet_jax.vocabulary import TARGETS, make_split
+from tdanet_jax.splits import make_split
+from tdanet_jax.vocabulary import TARGETS
 from tests.support import original, toy
 
 
