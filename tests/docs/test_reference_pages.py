@@ -1,0 +1,180 @@
+"""The reference pages agree with the code, and their figures with each other."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import io
+import json
+import re
+import statistics
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tdanet_jax.evaluation.report import Provenance
+from tdanet_jax.scenes import SceneTables
+from tdanet_jax.scenes.visibility.rules import RULES
+from tests.support.pages import DOCS
+
+ROOT = DOCS.parent
+PAGES = ("data", "scenes", "evaluation", "analysis", "results", "speed", "reliability")
+COMMANDS = (
+    "attention", "benchmark", "evaluate", "replay", "scaling", "scenes verify", "scenes inspect",
+    "scenes build", "scenes import", "scenes export", "scenes collect", "share", "sweep",
+    "train_zero_shot", "trajectories",
+)  # fmt: skip
+#: Flags of other programs that the pages mention.
+FOREIGN = {"--check", "--xla_gpu_deterministic_ops"}
+
+
+def text(page: str) -> str:
+    return (DOCS / f"{page}.md").read_text()
+
+
+def section(page: str, title: str) -> str:
+    """What is below a heading, up to the next one of its level or above."""
+    found = re.search(rf"^(#+) {re.escape(title)}$", text(page), re.MULTILINE)
+    assert found is not None, title
+    rest = text(page)[found.end() :]
+    end = re.search(rf"^#{{1,{len(found[1])}}} ", rest, re.MULTILINE)
+    return rest[: end.start()] if end else rest
+
+
+def rows(part: str) -> Iterator[list[str]]:
+    """The cells of every line of the tables in a part of a page."""
+    for line in part.splitlines():
+        if line.startswith("| "):
+            yield [cell.strip() for cell in line.strip("|").split(" | ")]
+
+
+def code(part: str) -> list[str]:
+    """What stands between single backticks, outside of blocks."""
+    outside = re.sub(r"^```.*?^```", "", part, flags=re.DOTALL | re.MULTILINE)
+    return re.findall(r"`([^`]+)`", outside)
+
+
+def named(part: str) -> set[str]:
+    """What the first cells of a part's tables name in backticks."""
+    return {name for cells in rows(part) for name in code(cells[0])}
+
+
+def pages(*words: str) -> Any:
+    return pytest.mark.parametrize("page", words or PAGES)
+
+
+@pages()
+def test_files_that_a_page_names_exist(page: str) -> None:
+    named = {word for word in code(text(page)) if re.fullmatch(r"[\w./-]+", word)}
+    kept = ("tests/", "tdanet_jax/", "experiments/", "assets/", "agents/18", "notebooks/")
+    missing = [word for word in named if word.startswith(kept) and not (ROOT / word).exists()]
+    tests = re.findall(r"pytest -m slow (\S+?)[\s`]", text(page))
+    assert missing + [path for path in tests if not (ROOT / path).exists()] == []
+
+
+@pages()
+def test_names_of_the_package_that_a_page_mentions_exist(page: str) -> None:
+    for name in re.findall(r"`tdanet_jax\.([\w.]+)", text(page)):
+        found: Any = importlib.import_module("tdanet_jax")
+        path = "tdanet_jax"
+        for part in name.split("."):
+            path = f"{path}.{part}"
+            if not hasattr(found, part):
+                importlib.import_module(path)
+            found = getattr(found, part)
+
+
+@pytest.fixture(scope="module")
+def flags() -> set[str]:
+    """The flags of all commands, as their help shows them."""
+    known = set()
+    for command in COMMANDS:
+        name, *rest = command.split()
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), pytest.raises(SystemExit):
+            importlib.import_module(f"experiments.{name}").main([*rest, "--help"])
+        known |= set(re.findall(r"--[a-z][\w-]*", said.getvalue()))
+    return known
+
+
+@pages()
+def test_flags_that_a_page_mentions_exist(page: str, flags: set[str]) -> None:
+    assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text(page))) - flags - FOREIGN == set()
+
+
+def test_fields_of_the_results() -> None:
+    told = named(section("evaluation", "Fields of `results.json`")) - {"Field"}
+    groups = {"seen", "unseen", "by_room", "by_target"}
+    fields = {field.name for field in dataclasses.fields(Provenance)}
+    assert told == fields | groups | {"version", "commit"}
+
+
+def test_fields_of_the_records() -> None:
+    (line,) = (c[1] for c in rows(section("evaluation", "What it writes")) if "one record" in c[1])
+    with (ROOT / "agents/18-4-best/episodes.jsonl").open() as file:
+        assert re.findall(r"`(\w+)`", line) == list(json.loads(file.readline()))
+
+
+def test_fields_of_the_tables() -> None:
+    fields = {field.name for field in dataclasses.fields(SceneTables)}
+    assert named(section("scenes", "The scene tables")) == fields
+
+
+def test_the_rules_of_the_rooms() -> None:
+    told = {cells[0]: cells[1] for cells in rows(section("scenes", "The rules"))}
+    figures = {
+        "Reach": f"within {RULES.reach} m",
+        "Slivers": f"{100 * RULES.sliver:g} %",
+        "Carved": f"within {RULES.standing} m",
+        "Plates": f"top {100 * RULES.thickness:g} cm",
+        "Inset": f"{100 * RULES.inset:g} %",
+        "Walls": f"more than {RULES.void} m",
+    }
+    for rule, figure in figures.items():
+        assert figure in told[rule]
+    for rule, classes in {
+        "Fronts": RULES.fronts,
+        "Carved": RULES.carved,
+        "Closed": RULES.closed,
+        "Plates": RULES.plates,
+    }.items():
+        assert classes == set(re.findall(r"\b[A-Z]\w+", told[rule])) - {"L", "U"}
+
+
+@pytest.mark.parametrize(
+    "title", ["Zero-shot split 18/4", "Odometry", "Triangulation", "Zero-shot split 14/8"]
+)
+def test_means_and_deviations_are_those_of_the_seeds(title: str) -> None:
+    """To the last digit that is shown: the seeds' own figures are rounded."""
+    seeds: list[list[float]] = []
+    checked = 0
+    for cells in rows(section("results", title)):
+        cells = cells[1:] if cells[0] in ("none", "`--preset best`") else cells
+        figures = [float(cell.split()[0]) for cell in cells[1:5] if re.match(r"\d+\.\d", cell)]
+        if cells[0] in ("0", "1", "2"):
+            seeds.append(figures)
+        elif cells[0] == "mean ± sd":
+            assert len(seeds) == 3
+            for cell, values in zip(cells[1:5], zip(*seeds, strict=True), strict=True):
+                mean, deviation = map(float, cell.split(" ± "))
+                assert mean == pytest.approx(statistics.fmean(values), abs=0.101)
+                assert deviation == pytest.approx(statistics.stdev(values), abs=0.101)
+                checked += 1
+            seeds = []
+    assert checked == (8 if "14/8" in title else 4)
+
+
+def test_figures_of_the_bundled_agent() -> None:
+    found = json.loads((ROOT / "agents/18-4-best/results.json").read_text())
+    told = " ".join(section("results", "The bundled agent").split())
+    pairs = [found[group]["L>=1"] for group in ("seen", "unseen")]
+    assert " and ".join(f"{pair['SR']:.1f} / {pair['SPL']:.1f}" for pair in pairs) in told
+
+
+def test_the_pages_show_no_path_of_anybody() -> None:
+    for page in PAGES:
+        assert not re.search(r"/(home|tmp|root|work)/", text(page)), page
+    assert Path(DOCS / "scaling.png").exists()
