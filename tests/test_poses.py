@@ -1,5 +1,7 @@
 """Poses and their parts, for whole numbers and for arrays of NumPy and JAX."""
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 import numpy as np
 import pytest

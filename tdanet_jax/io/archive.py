@@ -1,5 +1,7 @@
 """NumPy archives whose bytes depend on their content alone."""
 
+from __future__ import annotations
+
 import io
 import zipfile
 from collections.abc import Mapping

@@ -1,5 +1,7 @@
 """Where the bundled data files live, and whether they are the files that were built."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 from functools import cache
@@ -35,7 +37,7 @@ def path(name: str) -> Path:
     """Path of the bundled file `name`, its content verified (once per process).
 
     Raises:
-        AssetError: the file is missing, unlisted or corrupt.
+      AssetError: the file is missing, unlisted or corrupt.
     """
     root = folder()
     file = root / name

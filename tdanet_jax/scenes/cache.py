@@ -5,6 +5,8 @@ source of the modules that compute the tables. Files appear whole or not at all,
 that find none at the same time one computes while the others wait.
 """
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import importlib

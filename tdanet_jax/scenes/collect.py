@@ -3,6 +3,8 @@
 The controller is an argument: this module needs neither Unity nor the `ai2thor` package.
 """
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -22,11 +24,11 @@ def collect(controller: Any, rooms: Iterable[tuple[str, str]]) -> list[dict[str,
     """Scene documents of AI2-THOR scenes.
 
     Args:
-        controller: an `ai2thor.controller.Controller`, or anything with its `reset` and `step`.
-        rooms: (AI2-THOR scene name, room type) pairs.
+      controller: an `ai2thor.controller.Controller`, or anything with its `reset` and `step`.
+      rooms: (AI2-THOR scene name, room type) pairs.
 
     Raises:
-        SceneError: an action failed.
+      SceneError: an action failed.
     """
     documents = []
     for name, room_type in rooms:

@@ -73,7 +73,7 @@ class Rooms:
 
     Attributes:
       path: the file that they were read from, beside which their feature maps lie; None if there
-        is none.
+      is none.
     """
 
     tables: SceneTables

@@ -1,5 +1,7 @@
 """The one error that malformed scenes and broken scene files raise."""
 
+from __future__ import annotations
+
 
 class SceneError(ValueError):
     """A scene breaks a rule; the message is one line naming scene, object and rule."""

@@ -6,6 +6,8 @@ metadata of one default frame per room, `alfworld` the reachable points of the 0
 default frame is not written down in the metadata: it follows from the distances to all objects.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import io
 import json

@@ -14,6 +14,8 @@ Of each object are read objectId, objectType, axisAlignedBoundingBox and, where 
 objectOrientedBoundingBox, rotation, openable, isOpen, pickupable, parentReceptacles, visible.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import json
 import math
@@ -45,7 +47,7 @@ def parse_scene(
     """A room from AI2-THOR's object records and reachable points [P, 3]; points are sorted.
 
     Raises:
-        SceneError: a record or the points break a rule; names scene, object and rule.
+      SceneError: a record or the points break a rule; names scene, object and rule.
     """
     objects = [parse_object(name, r) for r in records if _text(name, r, "objectType") != IGNORED]
     objects.sort(key=lambda item: (item.object_class, item.object_id))
@@ -62,7 +64,7 @@ def check_points(name: str, points: np.ndarray) -> np.ndarray:
     """Reachable points [P, 3] sorted by (x, z), without repeats.
 
     Raises:
-        SceneError: there are none, or they do not lie on a grid of 0.25 m.
+      SceneError: there are none, or they do not lie on a grid of 0.25 m.
     """
     if len(points) == 0:
         raise SceneError(f"{name}: no reachable position")
@@ -83,7 +85,7 @@ def parse_object(scene: str, record: Mapping[str, Any]) -> SceneObject:
     """One object from its metadata record.
 
     Raises:
-        SceneError: a field is missing, of the wrong kind, or not finite.
+      SceneError: a field is missing, of the wrong kind, or not finite.
     """
     name = _text(scene, record, "objectId")
     box = record.get("axisAlignedBoundingBox")
@@ -154,7 +156,7 @@ def read_scenes(path: Path) -> list[Scene]:
     """The rooms of a scene file.
 
     Raises:
-        SceneError: it is not such a file, or a scene breaks a rule; one line naming where.
+      SceneError: it is not such a file, or a scene breaks a rule; one line naming where.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -1,5 +1,7 @@
 """Plain records of a room: what any source of scenes must deliver."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

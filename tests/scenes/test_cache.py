@@ -1,5 +1,7 @@
 """The cache: built once, checked when read, safe among processes."""
 
+from __future__ import annotations
+
 import os
 import subprocess
 import sys
@@ -19,8 +21,7 @@ BUILDER = """
 import time
 import numpy as np
 from tdanet_jax.scenes import cache, ithor
-from tests import toy
-from tests import toy
+from tests.support import toy
 def rooms():
     print("building", flush=True)
     time.sleep(2.0)

@@ -1,5 +1,7 @@
 """The collector against a controller that only pretends."""
 
+from __future__ import annotations
+
 import copy
 from pathlib import Path
 from types import SimpleNamespace

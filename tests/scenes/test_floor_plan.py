@@ -1,5 +1,7 @@
 """Floor plans: every object's outline, oriented where that is known."""
 
+from __future__ import annotations
+
 import dataclasses
 
 import numpy as np

@@ -1,5 +1,7 @@
 """The bundled rooms: made from (synthetic) wheels, read back; from the real ones bit by bit."""
 
+from __future__ import annotations
+
 import io
 import json
 import os

@@ -1,5 +1,7 @@
 """Scene files: what they mean, and that broken ones are refused in one line."""
 
+from __future__ import annotations
+
 import copy
 import json
 from pathlib import Path

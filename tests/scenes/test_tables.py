@@ -1,5 +1,7 @@
 """The tables' invariants, their subsets, and their way to disk and back."""
 
+from __future__ import annotations
+
 import dataclasses
 from pathlib import Path
 

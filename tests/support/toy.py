@@ -1,5 +1,7 @@
 """Rooms small enough to check by hand, and random ones."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from tdanet_jax.poses import GRID_SIZE

@@ -1,5 +1,7 @@
 """The one error that broken or hostile files raise."""
 
+from __future__ import annotations
+
 LONGEST = 200  # characters of a reason; what a library says of a broken file may be endless
 
 

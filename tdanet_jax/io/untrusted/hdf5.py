@@ -1,5 +1,7 @@
 """HDF5 from outside: hard-linked, plainly stored, small datasets of numbers, and nothing else."""
 
+from __future__ import annotations
+
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,11 +37,11 @@ class Reader:
         """The numbers of a dataset.
 
         Args:
-            shape: what its shape must be, if that is known.
+          shape: what its shape must be, if that is known.
 
         Raises:
-            FileError: it is a link to elsewhere, is stored elsewhere, too large, not numbers, not
-                finite, or of another shape.
+          FileError: it is a link to elsewhere, is stored elsewhere, too large, not numbers, not
+            finite, or of another shape.
         """
         import h5py
 
@@ -92,7 +94,7 @@ def opened(path: Path) -> Iterator[Reader]:
     """Opens a file to read from it.
 
     Raises:
-        FileError: it is missing or no HDF5 file, or h5py is not installed.
+      FileError: it is missing or no HDF5 file, or h5py is not installed.
     """
     need_h5py(path)
     import h5py

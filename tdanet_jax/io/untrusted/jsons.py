@@ -1,5 +1,7 @@
 """JSON from outside: no NaN, no endless files, and large objects one member at a time."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +18,7 @@ def load(path: Path) -> Any:
     """The content of a JSON file; NaN and Infinity are refused.
 
     Raises:
-        FileError: the file is missing, too large or not JSON.
+      FileError: the file is missing, too large or not JSON.
     """
     text = _text(path)
     try:
@@ -29,7 +31,7 @@ def members(path: Path) -> Iterator[tuple[str, Any]]:
     """Names and values of the one object in a JSON file, decoded one after the other.
 
     Raises:
-        FileError: the file is missing, too large, or not a JSON object.
+      FileError: the file is missing, too large, or not a JSON object.
     """
     text = _text(path)
     decoder = _decoder()
@@ -61,7 +63,7 @@ def number(path: Path | str, value: Any, what: str, most: float) -> float:
     """A finite number of at most `most` in size.
 
     Raises:
-        FileError: it is none; the message names `what`.
+      FileError: it is none; the message names `what`.
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise FileError(path, f"{what} is not a number")

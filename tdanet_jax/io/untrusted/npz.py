@@ -1,5 +1,7 @@
 """NumPy archives from outside: arrays of plain numbers, their sizes known before they are read."""
 
+from __future__ import annotations
+
 import math
 import zipfile
 from pathlib import Path
@@ -16,7 +18,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
     """All arrays of an npz.
 
     Raises:
-        FileError: it is no such file, is damaged, or holds objects or names of other places.
+      FileError: it is no such file, is damaged, or holds objects or names of other places.
     """
     if not path.is_file():
         raise FileError(path, "no such file")

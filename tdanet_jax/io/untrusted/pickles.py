@@ -221,10 +221,10 @@ def load(data: bytes, path: object) -> Any:
     """The value of a pickle: plain values, `Call`s and `Name`s.
 
     Args:
-        path: names the file in messages.
+      path: names the file in messages.
 
     Raises:
-        FileError: it is no pickle, or holds something that is not on the list.
+      FileError: it is no pickle, or holds something that is not on the list.
     """
     return _run(io.BytesIO(data), str(path))[0]
 
@@ -233,7 +233,7 @@ def load_torch(data: bytes, path: object) -> Any:
     """The value of a file that torch.save wrote, in either of its formats.
 
     Raises:
-        FileError: it is no such file, or holds something that is not on the list.
+      FileError: it is no such file, or holds something that is not on the list.
     """
     if data[:2] == b"PK":
         return _load_zip(data, str(path))
@@ -296,7 +296,7 @@ def array(value: Any, path: object) -> np.ndarray:
     """The numbers of a pickled NumPy array or torch tensor.
 
     Raises:
-        FileError: it is neither, or not of plain numbers, or too large.
+      FileError: it is neither, or not of plain numbers, or too large.
     """
     try:
         if isinstance(value, Call) and value.name in _ARRAY:

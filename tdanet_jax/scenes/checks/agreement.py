@@ -5,6 +5,8 @@ by pixel and in plain NumPy, judges the sampling by patches on the same solids: 
 of how faithful the solids are.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -28,7 +30,7 @@ class Count:
     extras: int = 0  # ours alone
     misses: int = 0  # theirs alone
 
-    def __add__(self, other: "Count") -> "Count":
+    def __add__(self, other: Count) -> Count:
         return Count(
             self.hits + other.hits,
             self.extras + other.extras,
@@ -116,7 +118,7 @@ def _pixel_rays(turn: float, tilt: float, pixels: int) -> np.ndarray:
     """Directions [pixels^2, 3] through the pixels' middles, rows from the top; depth 1.
 
     Args:
-        turn, tilt: of the camera, in radians clockwise from +z and down.
+      turn, tilt: of the camera, in radians clockwise from +z and down.
     """
     right = np.array([np.cos(turn), 0, -np.sin(turn)])
     level = np.array([np.sin(turn), 0, np.cos(turn)])

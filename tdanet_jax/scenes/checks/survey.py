@@ -1,5 +1,7 @@
 """What a user should know of a set of rooms before training: targets and parts out of reach."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -44,12 +44,12 @@ def write_folder(
     """Writes a folder with one folder a scene; it appears whole or not at all.
 
     Args:
-        out: must not exist.
-        report: called with the share done and the name of each scene.
-        parents: room type -> target -> parent -> R_p, for `c2p_prob.json`.
-        vectors: [C, D] one vector per class, for `thor_glove/glove_map<D>d.hdf5`.
-        features: also write `resnet18_featuremap.hdf5`: channel c of a map is 1 in the cells of the
-            7 x 7 raster that show class c of `tables.classes`, 0 elsewhere.
+      out: must not exist.
+      report: called with the share done and the name of each scene.
+      parents: room type -> target -> parent -> R_p, for `c2p_prob.json`.
+      vectors: [C, D] one vector per class, for `thor_glove/glove_map<D>d.hdf5`.
+      features: also write `resnet18_featuremap.hdf5`: channel c of a map is 1 in the cells of the
+        7 x 7 raster that show class c of `tables.classes`, 0 elsewhere.
     """
     if vectors is not None or features:
         hdf5.need_h5py(out)

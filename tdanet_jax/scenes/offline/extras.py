@@ -26,10 +26,10 @@ def read_extras(folders: Iterable[Path], grids: Mapping[str, Grid]) -> tuple[Ext
     """What the first folder that has it holds of each kind, and a line for each.
 
     Args:
-        grids: the imported scenes; episodes in others are left out.
+      grids: the imported scenes; episodes in others are left out.
 
     Raises:
-        FileError: a file is broken; names file and reason.
+      FileError: a file is broken; names file and reason.
     """
     places = list(folders)
     parents, adjacency = _first(places, PARENT_FILE), _first(places, GRAPH_FOLDER)
@@ -63,7 +63,7 @@ def read_parents(path: Path) -> dict[str, dict[str, dict[str, float]]]:
     """Room type -> target -> parent -> R_p, of `c2p_prob.json`.
 
     Raises:
-        FileError: it is not of this shape, or a reward is not between 0 and 100.
+      FileError: it is not of this shape, or a reward is not between 0 and 100.
     """
     result: dict[str, dict[str, dict[str, float]]] = {}
     for title, targets in jsons.members(path):
@@ -88,7 +88,7 @@ def read_graph(names_path: Path, matrix_path: Path) -> tuple[tuple[str, ...], np
     """The class graph: n names and the adjacency [n, n] float32.
 
     Raises:
-        FileError: a file is missing or broken, or they do not match.
+      FileError: a file is missing or broken, or they do not match.
     """
     for path in (names_path, matrix_path):
         if not path.is_file() or path.stat().st_size > pickles.LARGEST_FILE:
@@ -111,7 +111,7 @@ def read_episodes(path: Path, grids: Mapping[str, Grid]) -> tuple[list[Published
     """The episodes of `<room>_<test|val>.pkl` in known scenes, and how many are in others.
 
     Raises:
-        FileError: it is not a list of episodes, or a start is not on its scene's grid.
+      FileError: it is not a list of episodes, or a start is not on its scene's grid.
     """
     part = path.stem.rpartition("_")[2]
     if part not in PARTS or path.stat().st_size > pickles.LARGEST_FILE:

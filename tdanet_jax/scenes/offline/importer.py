@@ -50,11 +50,11 @@ def read_folder(folder: Path, report: Report) -> Rooms:
     `forget` is called, so that an import that was stopped goes on where it was.
 
     Args:
-        folder: holds folders FloorPlan*, or holds one folder that does.
-        report: called with the share done and a line for every scene and every further file.
+      folder: holds folders FloorPlan*, or holds one folder that does.
+      report: called with the share done and a line for every scene and every further file.
 
     Raises:
-        FileError: there are no scenes, or a file is broken; names file and reason.
+      FileError: there are no scenes, or a file is broken; names file and reason.
     """
     root = find_root(folder)
     chosen = find_scenes(root)
@@ -85,7 +85,7 @@ def find_root(folder: Path) -> Path:
     """The folder whose children are the scenes: `folder`, or one folder or two inside it.
 
     Raises:
-        FileError: there is none.
+      FileError: there is none.
     """
     for pattern in ("FloorPlan*", "*/FloorPlan*", "*/*/FloorPlan*"):
         for place in sorted(folder.glob(pattern)):
@@ -98,7 +98,7 @@ def find_scenes(root: Path) -> list[tuple[str, int, Path]]:
     """Name, room type and folder of each scene, by room type and number.
 
     Raises:
-        FileError: a scene is there twice.
+      FileError: a scene is there twice.
     """
     found: dict[str, tuple[str, int, Path]] = {}
     for place in sorted(root.glob("FloorPlan*")):
@@ -122,7 +122,7 @@ def make_tables(root: Path, rooms: Sequence[SceneData]) -> SceneTables:
     """The tables of all rooms; the vocabulary is theirs, the targets those of the 22 in it.
 
     Raises:
-        FileError: there are more classes than the tables can number.
+      FileError: there are more classes than the tables can number.
     """
     classes = tuple(sorted({o.object_class for data in rooms for o in data.scene.objects}))
     if len(classes) > MOST_CLASSES:
@@ -198,7 +198,7 @@ def find_features(folder: Path) -> dict[str, Path]:
     """The feature file of each scene of a folder.
 
     Raises:
-        FileError: a scene has none, or h5py, which reads them, is not installed.
+      FileError: a scene has none, or h5py, which reads them, is not installed.
     """
     found = {name: place / FEATURE_FILE for name, _, place in find_scenes(find_root(folder))}
     for path in found.values():
@@ -217,11 +217,11 @@ def save(
     """Writes a file of rooms and, beside it, their feature maps: both whole, or neither.
 
     Args:
-        features: from `find_features`; None writes no maps.
-        report: called with the share done and a line for every scene's maps.
+      features: from `find_features`; None writes no maps.
+      report: called with the share done and a line for every scene's maps.
 
     Raises:
-        FileError: a feature file is broken.
+      FileError: a feature file is broken.
     """
     with contextlib.ExitStack() as stack:
         if features is not None:
@@ -236,12 +236,12 @@ def write_features(
     """Writes every scene's feature maps into one memory-mapped file.
 
     Args:
-        sources: the feature file of each scene.
-        out: a .npy of [S, 512, 7, 7] float16, S states in the order of the tables; zero where a
-            scene's file has no map of a state.
+      sources: the feature file of each scene.
+      out: a .npy of [S, 512, 7, 7] float16, S states in the order of the tables; zero where a
+        scene's file has no map of a state.
 
     Raises:
-        FileError: a feature file is broken.
+      FileError: a feature file is broken.
     """
     features = np.lib.format.open_memmap(out, "w+", np.float16, (tables.num_states, *FEATURE_SHAPE))
     for i, name in enumerate(tables.scenes):
@@ -279,7 +279,7 @@ def load_features(data: Path, tables: SceneTables) -> np.ndarray:
     """The imported feature maps of a file of rooms, memory-mapped: [S, 512, 7, 7] float16.
 
     Raises:
-        FileError: there are none, or they are those of other rooms.
+      FileError: there are none, or they are those of other rooms.
     """
     path = features_path(data)
     if not path.is_file():

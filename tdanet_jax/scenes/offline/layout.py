@@ -1,5 +1,7 @@
 """Names of files and states in the original offline data. docs/data.md describes them all."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -72,7 +74,7 @@ class Grid:
         """The state that a key names; "-0.00" and "0.00" are one place.
 
         Raises:
-            FileError: it is no key, or its point is not on the grid.
+          FileError: it is no key, or its point is not on the grid.
         """
         if not isinstance(key, str):
             raise FileError(path, "a state key that is no text")
@@ -90,7 +92,7 @@ class Grid:
         """The state at a place in metres, with a rotation and a horizon in degrees.
 
         Raises:
-            FileError: there is none.
+          FileError: there is none.
         """
         key = state_key(x, z, rotation, horizon)
         if rotation % 45 or not 0 <= rotation < 360 or horizon not in (0, 30):

@@ -60,7 +60,7 @@ def read_scene(folder: Path, name: str, room_type: int) -> SceneData:
     """Reads a scene's folder, one file after the other.
 
     Raises:
-        FileError: a file is missing, broken, or contradicts another; names file and reason.
+      FileError: a file is missing, broken, or contradicts another; names file and reason.
     """
     grid = read_grid(folder / GRID_FILE)
     next_position, odd = read_graph(folder / GRAPH_FILE, grid)
@@ -94,7 +94,7 @@ def read_grid(path: Path) -> Grid:
     """The reachable points of `grid.json`.
 
     Raises:
-        FileError: they are not x, y, z in metres on a grid of 0.25 m.
+      FileError: they are not x, y, z in metres on a grid of 0.25 m.
     """
     content = jsons.load(path)
     if not isinstance(content, list) or len(content) > MOST_POINTS:
@@ -119,7 +119,7 @@ def read_graph(path: Path, grid: Grid) -> tuple[np.ndarray, list[str]]:
     so links that are no step of the five moving actions have no effect, there as here.
 
     Raises:
-        FileError: it is no node-link graph, or a link leads to a missing node.
+      FileError: it is no node-link graph, or a link leads to a missing node.
     """
     content = jsons.load(path)
     if not isinstance(content, Mapping):
@@ -182,7 +182,7 @@ def read_visibility(path: Path, grid: Grid) -> _Visibility:
     under an object's id, or an event under a state's key.
 
     Raises:
-        FileError: it is neither.
+      FileError: it is neither.
     """
     known = _Visibility({}, {}, defaultdict(set))
     for name, value in jsons.members(path):
@@ -245,7 +245,7 @@ def read_objects(path: Path, grid: Grid, known: _Visibility) -> dict[int, list[s
     """Adds the objects of our own `objects.json`; the ids behind each state's boxes, in order.
 
     Raises:
-        FileError: it does not fit the other files.
+      FileError: it does not fit the other files.
     """
     content = jsons.load(path)
     objects = content.get("objects") if isinstance(content, Mapping) else None
@@ -282,7 +282,7 @@ def read_boxes(path: Path, grid: Grid) -> Iterator[tuple[int, dict[str, np.ndarr
     """State and class -> boxes [n, 4] in table units (sixteenths of a pixel), state by state.
 
     Raises:
-        FileError: a number is missing, not finite or outside the image.
+      FileError: a number is missing, not finite or outside the image.
     """
     for key, groups in jsons.members(path):
         state = grid.state(path, key)

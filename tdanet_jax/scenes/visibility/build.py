@@ -6,6 +6,8 @@ seen patches, clipped to the image. Projections are element-wise float32 operati
 IEEE 754 defines to the last bit, so that tables are equal on every machine.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -134,8 +136,8 @@ def _boxes_in_view(
     """Extents of the seen patches in every view, per position and object.
 
     Args:
-        position, patch, group: [V] camera, patch and (camera, object) index of each patch that
-            nothing hides, sorted. least: [P * O] area in view from which an object is visible.
+      position, patch, group: [V] camera, patch and (camera, object) index of each patch that
+        nothing hides, sorted. least: [P * O] area in view from which an object is visible.
     """
     area, owner = patches.area[patch], patches.owner[patch]
     center, corner, eye = (a.astype(np.float32) for a in (patches.center, patches.corner, cameras))

@@ -4,6 +4,8 @@ World axes are AI2-THOR's: x right, y up, z forward, left-handed; metres. Headin
 +z clockwise seen from above (90 degrees looks along +x), in steps of 45 degrees.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from tdanet_jax import poses
@@ -14,8 +16,8 @@ def box_frame(box: np.ndarray, corners: np.ndarray | None) -> tuple[np.ndarray, 
     """An object's tightest known box as origin corner [3] and edge vectors [3, 3] (rows).
 
     Args:
-        box: [2, 3] axis-aligned box. corners: [8, 3] of the oriented box in AI2-THOR's order
-            (bottom face around, then top face around), if it is known.
+      box: [2, 3] axis-aligned box. corners: [8, 3] of the oriented box in AI2-THOR's order
+        (bottom face around, then top face around), if it is known.
     """
     if corners is None:
         return box[0], np.diag(box[1] - box[0])
@@ -56,11 +58,11 @@ def action_distances(successor: np.ndarray, goals: np.ndarray) -> np.ndarray:
     """Fewest actions from each state to a goal state, -1 where there is no way.
 
     Args:
-        successor: [S, A] int, state after each action.
-        goals: [S, G] bool, goal states of each of G <= 64 targets.
+      successor: [S, A] int, state after each action.
+      goals: [S, G] bool, goal states of each of G <= 64 targets.
 
     Returns:
-        [S, G] int16. All targets advance together: one bit of a word each.
+      [S, G] int16. All targets advance together: one bit of a word each.
     """
     count = goals.shape[1]
     bits = np.uint64(1) << np.arange(count, dtype=np.uint64)
@@ -82,7 +84,7 @@ def lattice(origins: np.ndarray, edges: np.ndarray, steps: int = 8) -> np.ndarra
     """Centres of the steps^3 cells of each of O boxes: [O, K, 3].
 
     Args:
-        origins: [O, 3] a corner of each box. edges: [O, 3, 3] its edge vectors.
+      origins: [O, 3] a corner of each box. edges: [O, 3, 3] its edge vectors.
     """
     share = (np.arange(steps) + 0.5) / steps
     cells = np.stack(np.meshgrid(share, share, share, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -97,8 +99,8 @@ def frustum_rotation(points: np.ndarray, visible: np.ndarray, camera: np.ndarray
     the rules that are judged by these flags. Ties go to the least rotation.
 
     Args:
-        points: [O, K, 3] points spread over each object within reach, metres.
-        visible: [O] bool, AI2-THOR's flags. camera: [3] metres.
+      points: [O, K, 3] points spread over each object within reach, metres.
+      visible: [O] bool, AI2-THOR's flags. camera: [3] metres.
     """
     offset = points - camera
     scores = []

@@ -3,6 +3,8 @@
 It stands in for the convolutional feature maps that image-based models expect.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 CELLS = 7  # along each side of the image
@@ -17,8 +19,8 @@ def paint(
     later rows cover earlier ones of equal area. A cell under no box holds -1.
 
     Args:
-        state: [N] state of each box. box: [N, 4] x1, y1, x2, y2. label: [N] class, below 128.
-        size: width and height of the image in the units of `box`.
+      state: [N] state of each box. box: [N, 4] x1, y1, x2, y2. label: [N] class, below 128.
+      size: width and height of the image in the units of `box`.
     """
     box = box.astype(np.int32)
     # Cell c is covered if its middle, (c + 1/2) * size / 7, lies in [low, high).

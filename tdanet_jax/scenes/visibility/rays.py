@@ -5,6 +5,8 @@ cross-multiplication, where no product reaches 2^31. No rounding means that ever
 compiler and version gives the same answer.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -50,7 +52,7 @@ def blocked_by_box(
     Touching is not meeting.
 
     Args:
-        lo, hi: [3] corners of the box. kind: scalar. All int32, below 2^15 in size.
+      lo, hi: [3] corners of the box. kind: scalar. All int32, below 2^15 in size.
     """
     step = [jnp.abs(ray[a]) for a in range(3)]
     ahead = [ray[a] >= 0 for a in range(3)]

@@ -5,6 +5,8 @@ boxes only, so a few rules say how the box of each kind of object is to be read.
 on the default frames of the 80 training rooms; `experiments.scenes verify` shows the agreement.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 

@@ -1,5 +1,7 @@
 """From a room's objects to what rays are cast at and what stops them, as the rules say."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,7 +101,7 @@ def solids_of(scene: Scene, rules: Rules) -> Solids:
     """The boxes of a room that hide things.
 
     Raises:
-        SceneError: the room is too large or too full for exact 32-bit ray casting.
+      SceneError: the room is too large or too full for exact 32-bit ray casting.
     """
     aligned = [(box, OPEN) for box in void_boxes(scene, rules)]
     turned = []

@@ -1,5 +1,7 @@
 """HDF5 from outside."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,7 @@
 """JSON from outside."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 

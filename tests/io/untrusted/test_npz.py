@@ -1,5 +1,7 @@
 """Archives of arrays from outside."""
 
+from __future__ import annotations
+
 import io
 import zipfile
 from pathlib import Path

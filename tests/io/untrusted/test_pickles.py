@@ -1,5 +1,7 @@
 """Pickles from outside: the shapes that are known come out, nothing is ever called."""
 
+from __future__ import annotations
+
 import io
 import os
 import pickle

@@ -1,5 +1,7 @@
 """What is out of reach is found, with its reason."""
 
+from __future__ import annotations
+
 import dataclasses
 
 from tdanet_jax.scenes import SceneTables, tables

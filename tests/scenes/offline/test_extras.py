@@ -1,5 +1,7 @@
 """Parents, class graph and published episodes, and how a task uses them."""
 
+from __future__ import annotations
+
 import json
 import os
 import pickle

@@ -1,5 +1,7 @@
 """A scene's folder: every variant of its files, by hand, and everything that is refused."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """What the camera sees: by hand, against dense ray casting, and under symmetries."""
 
+from __future__ import annotations
+
 import dataclasses
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Steps, transitions and action distances against counting by hand and against scipy."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 from hypothesis import given

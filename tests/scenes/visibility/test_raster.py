@@ -1,5 +1,7 @@
 """The class raster against painting cell by cell."""
 
+from __future__ import annotations
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,5 +1,7 @@
 """Exact ray casting against fractions of whole numbers."""
 
+from __future__ import annotations
+
 from fractions import Fraction
 
 import numpy as np
