@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import jax
     import numpy as np
 
-    from tdanet_jax.env.dynamics import EnvParams
+    from tdanet_jax.env.types import EnvParams
     from tdanet_jax.scenes import SceneTables
     from tdanet_jax.task import Task
     from tdanet_jax.tools.benchmarking import Row
@@ -123,8 +123,9 @@ def with_rooms(task: Task, count: int) -> EnvParams:
     """The environment of `count` training rooms: some of them, or all of them several times."""
     import numpy as np
 
-    from tdanet_jax.env import dynamics
+    from tdanet_jax.env.params import make_params
     from tdanet_jax.env.reward import Parents
+    from tdanet_jax.observation_spec import ObservationSpec
 
     names = task.split.train_scenes
     per_type = len(names) // 4
@@ -137,9 +138,8 @@ def with_rooms(task: Task, count: int) -> EnvParams:
     old = task.train_params
     parents = Parents(np.asarray(old.parent_class), np.asarray(old.parent_reward))
     tables = joined(parts)
-    return dynamics.make_params(
-        tables, task.split.seen, parents, old.step_limit.tolist(), merge=False
-    )
+    limits = old.step_limit.tolist()
+    return make_params(tables, task.split.seen, parents, limits, ObservationSpec())
 
 
 def joined(parts: list[SceneTables]) -> SceneTables:

@@ -196,7 +196,11 @@ def title(run: Run) -> str:
     """tdanet, split 18/4, seed 0; or tdanet, --odometry, ..."""
     from tdanet_jax.evaluation.report import agent_name
 
-    name = agent_name(run.config.model, run.model.odometry, run.model.triangulation)
+    name = agent_name(
+        run.config.model,
+        "odometry" in run.model.spec.sensors,
+        "triangulation" in run.model.spec.sensors,
+    )
     return f"{name}, split {run.task.split.name}, seed {run.config.seed}"
 
 
@@ -299,8 +303,8 @@ def report_on(run: Run, lists: Mapping[str, Episodes]) -> None:
         data_version=task.tables.data_version,
         data=run.config.data,
         image=task.image,
-        odometry=task.model.odometry,
-        triangulation=task.model.triangulation,
+        odometry="odometry" in task.spec.sensors,
+        triangulation="triangulation" in task.spec.sensors,
     )
     print_summary(report.write(run.folder, provenance, task.tables, played))
     console.print(f"wrote {run.folder / 'results.md'}")

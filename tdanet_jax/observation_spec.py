@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Literal
 
-#: Sensors by name, and the module that makes each. A custom sensor goes by its module's dotted name.
+#: Sensors by name, and the module that makes each. Custom ones go by their modules' dotted names.
 SENSORS: Mapping[str, str] = {
     "odometry": "tdanet_jax.sensors.odometry",
     "triangulation": "tdanet_jax.sensors.triangulation",

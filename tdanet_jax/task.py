@@ -12,20 +12,15 @@ import numpy as np
 from tdanet_jax import poses
 from tdanet_jax import words as word_vectors
 from tdanet_jax.config import TrainConfig
-from tdanet_jax.env import dynamics, zero_shot
-from tdanet_jax.env.dynamics import TEST_STEP_LIMITS, EnvParams
-from tdanet_jax.env.reward import (
-    Parents,
-    cosines,
-    find_parents,
-    greatest_similarity,
-    no_parents,
-    published_parents,
-)
+from tdanet_jax.env import reward, zero_shot
+from tdanet_jax.env.params import TEST_STEP_LIMITS, FeatureMaps, make_params
+from tdanet_jax.env.reward import Parents
+from tdanet_jax.env.types import EnvParams
 from tdanet_jax.models import class_graph
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.classes import Classes, make_classes
+from tdanet_jax.models.classes import ClassVocabulary, make_vocabulary
 from tdanet_jax.models.registry import make_model, resolve_precision
+from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.scenes.dataset import Extras, Rooms, load_rooms, with_own_rooms
 from tdanet_jax.scenes.offline import importer
 from tdanet_jax.scenes.tables import Progress, SceneTables
@@ -41,11 +36,11 @@ class Task:
     Attributes:
       tables: all rooms.
       split: which rooms and classes train.
-      classes: the vocabulary, and what of it training may know.
+      classes: the vocabulary, and the part of it that training may know.
       model: the network.
-      train_params: the training rooms, hidden classes filtered out.
-      eval_params: all rooms and classes, with the test step limits; `reset` begins in the rooms of
-        the evaluation alone.
+      train_params: the training rooms, without hidden classes.
+      eval_params: all rooms and classes, with the test step limits; `reset` begins in the
+        evaluation's rooms alone.
       train_words: [C, D], zero for hidden classes.
       words: [C, D], vectors of all classes.
       extras: what came with imported rooms; None with the bundled ones.
@@ -53,7 +48,7 @@ class Task:
 
     tables: SceneTables
     split: Split
-    classes: Classes
+    classes: ClassVocabulary
     model: ActorCritic
     train_params: EnvParams
     eval_params: EnvParams
@@ -62,30 +57,36 @@ class Task:
     extras: Extras | None = None
 
     @property
+    def spec(self) -> ObservationSpec:
+        """What the agent is shown."""
+        return self.model.spec
+
+    @property
     def image(self) -> str | None:
-        """What the model sees in words, if it looks at an image."""
-        if not self.model.encoder.IMAGE:
-            return None
-        maps = "ResNet-18's feature map of the frame"
-        return maps if self.model.encoder.maps else "the class in each of 7 x 7 cells of the frame"
+        """The image that the model is shown, in words, if there is one."""
+        return {
+            None: None,
+            "features": "ResNet-18's feature map of the frame",
+            "raster": "the class in each of 7 x 7 cells of the frame",
+        }[self.spec.image]
 
     def check_known(self, run: Path | str, names: tuple[str, ...]) -> None:
-        """Raises ValueError if the model knows classes by number, and by that of other classes.
+        """Raises ValueError if the model knows classes by index, and these rooms have others.
 
         Args:
           run: what to call the model.
-          names: the classes of its training rooms; empty if nobody knows.
+          names: the classes of its training rooms; empty if unknown.
         """
-        numbered = self.model.encoder.ROWS == "class" or self.model.encoder.IMAGE
-        if numbered and names and names != self.tables.classes:
+        by_index = self.model.encoder.ROWS == "class" or self.model.encoder.IMAGE
+        if by_index and names and names != self.tables.classes:
             raise ValueError(
-                f"{run}: the model knows classes by their number in the rooms of its training, "
+                f"{run}: the model knows classes by their index in its training rooms, "
                 "and these rooms have others"
             )
 
 
 def load_task(config: TrainConfig, progress: Progress | None = None) -> Task:
-    """The task of a configuration on the rooms and with the word vectors that it names.
+    """The task of a configuration, with the rooms and word vectors that it names.
 
     Args:
       progress: called with (rooms done, rooms in all) while bundled rooms are rebuilt.
@@ -122,20 +123,20 @@ def make_task(
     extras: Extras | None = None,
     features: np.ndarray | None = None,
 ) -> Task:
-    """The task of a configuration on the given rooms; the split is what they hold of it.
+    """The task of a configuration in the given rooms; the split is limited to what they hold.
 
     Args:
       config: the run's configuration.
       tables: all rooms.
       vectors: the word vectors.
-      extras: what came with imported rooms. Their parents and class graph, where there are any,
+      extras: what came with imported rooms. Their parents and class graph, if there are any,
         replace those found in the training rooms. Hidden classes are in neither.
-      features: [S, 512, 7, 7], ResNet-18's maps of all poses, for the models that look at an image.
-        Pictures show hidden classes, too: nothing can be filtered out of them.
+      features: [S, 512, 7, 7], ResNet-18's maps of all poses, for models that are shown an image.
+        Images show hidden classes as well: nothing can be filtered out of them.
 
     Raises:
-      ValueError: the rooms hold none to train or to evaluate in, a class has no word vector, or
-        the model looks at feature maps and there are none.
+      ValueError: there are no rooms to train or to evaluate in, a class has no word vector, or the
+        model needs feature maps and there are none.
     """
     split = make_split(config.split, config.validation)
     split = with_own_rooms(split, Rooms(tables, extras), config.validation)
@@ -144,46 +145,40 @@ def make_task(
     adjacency = None if extras is None else extras.class_graph(tables.classes)
     if adjacency is None:
         adjacency = class_graph.co_occurrence(seen_rooms)
-    classes = make_classes(tables.classes, split.hidden, adjacency)
+    classes = make_vocabulary(tables.classes, split.hidden, adjacency)
     model = make_model(config, classes)
-    if model.encoder.maps and features is None:
-        raise ValueError(f"{config.model} looks at feature maps, and these rooms have none")
-    shown = (model.encoder.ROWS or config.network.rows) == "class", model.encoder.IMAGE
-    maps = _feature_maps(features) if features is not None and model.encoder.maps else None
-    trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]
-    parents = _parents(seen_rooms, split, extras)
-    paid = config.learner.partial_reward
-    limits = [config.learner.step_limit] * len(ROOM_TYPES)
     words = vectors.table(tables.classes, config.network.word_norm)
     train_words = zero_shot.hide_words(words, tables.classes, split.hidden)
-    targets = {room: split.seen[room] + split.unseen[room] for room in ROOM_TYPES}
+    parents = _parents(seen_rooms, split, extras)
+    trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]
+    train_maps, eval_maps = _feature_maps(model, features, trains)
+    rewarded = config.learner.partial_reward
+    similarity = None
+    if rewarded == "similarity":
+        similarity = reward.greatest_similarity(seen_rooms, reward.cosines(train_words))
     return Task(
         tables=tables,
         split=split,
         classes=classes,
         model=model,
-        train_params=dynamics.make_params(
+        train_params=make_params(
             seen_rooms,
             split.seen,
-            parents if paid == "parents" else no_parents(seen_rooms),
-            limits,
-            *shown,
-            greatest_similarity(seen_rooms, cosines(train_words)) if paid == "similarity" else None,
-            _places(maps, trains),
-            odometry=model.odometry,
-            triangulation=model.triangulation,
+            parents if rewarded == "parents" else reward.no_parents(seen_rooms),
+            [config.learner.step_limit] * len(ROOM_TYPES),
+            model.spec,
+            similarity=similarity,
+            features=train_maps,
             size_noise=config.learner.size_noise,
         ),
-        eval_params=dynamics.make_params(
+        eval_params=make_params(
             tables,
-            targets,
+            {room: split.seen[room] + split.unseen[room] for room in ROOM_TYPES},
             parents,
             TEST_STEP_LIMITS,
-            *shown,
-            features=_places(maps, trains | True),
+            model.spec,
+            features=eval_maps,
             scenes=split.eval_scenes,
-            odometry=model.odometry,
-            triangulation=model.triangulation,
         ),
         train_words=jnp.asarray(train_words),
         words=jnp.asarray(words),
@@ -191,26 +186,30 @@ def make_task(
     )
 
 
-def _feature_maps(features: np.ndarray) -> jax.Array:
-    """[S, 512, 7, 7] -> [S, 49, 512], cells before channels."""
-    flat = features.reshape(*features.shape[:2], -1)
-    return jnp.asarray(np.ascontiguousarray(flat.swapaxes(1, 2)))
-
-
-def _places(maps: jax.Array | None, chosen: np.ndarray) -> tuple[jax.Array, np.ndarray] | None:
-    """The maps, and where among them the chosen positions [P] begin: nothing is copied."""
-    return None if maps is None else (maps, poses.join(np.flatnonzero(chosen)))
+def _feature_maps(
+    model: ActorCritic, features: np.ndarray | None, trains: np.ndarray
+) -> tuple[FeatureMaps | None, FeatureMaps | None]:
+    """The maps for the training positions [P] bool, and for all; none if the model needs none."""
+    if not model.encoder.maps:
+        return None, None
+    if features is None:
+        raise ValueError("the model needs ResNet-18's feature maps, and these rooms have none")
+    flat = features.reshape(*features.shape[:2], -1).swapaxes(1, 2)  # cells before channels
+    maps = jnp.asarray(np.ascontiguousarray(flat))  # shared by both: nothing is copied
+    chosen = (np.flatnonzero(trains), np.arange(len(trains)))
+    train, all_positions = (FeatureMaps(maps, poses.join(positions)) for positions in chosen)
+    return train, all_positions
 
 
 def _parents(seen_rooms: SceneTables, split: Split, extras: Extras | None) -> Parents:
     """Those that came with the rooms, else those found in the training rooms."""
     if extras is not None and extras.parents:
-        return published_parents(seen_rooms, split.seen, extras.parents, split.hidden)
-    return find_parents(seen_rooms, split.seen)
+        return reward.published_parents(seen_rooms, split.seen, extras.parents, split.hidden)
+    return reward.find_parents(seen_rooms, split.seen)
 
 
 def resolve(config: TrainConfig) -> TrainConfig:
-    """The configuration with every `auto` replaced by what suits this machine and the data."""
+    """The configuration with every "auto" replaced by what suits this machine and the data."""
     network = resolve_precision(config.network)
     if network.image == "auto":
         imported = config.data is not None and importer.features_path(Path(config.data)).is_file()

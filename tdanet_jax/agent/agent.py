@@ -1,14 +1,14 @@
-"""A trained agent on its own: detections of any detector in, an action out.
+"""A trained agent without any rooms: the detections of any detector in, an action out.
 
 agent = tdanet_jax.load("runs/my-run")
-memory = agent.start()
-memory, decision = agent.act(memory, [Detection("mug", 0.2, 0.3, 0.25, 0.4)], target="mug")
+state = agent.start()
+state, decision = agent.act(state, [Detection("mug", 0.2, 0.3, 0.25, 0.4)], target="mug")
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,16 +19,16 @@ import numpy as np
 from tdanet_jax import config as configs
 from tdanet_jax import words as word_vectors
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
-from tdanet_jax.env.dynamics import Observation
+from tdanet_jax.env.types import Observation
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models import classes as vocabularies
-from tdanet_jax.models.actor_critic import ActorCritic, Output
-from tdanet_jax.models.classes import Classes
-from tdanet_jax.models.layers import Carry
-from tdanet_jax.sensors import odometry
-from tdanet_jax.sensors.detections import centre_and_area, merge_classes
-from tdanet_jax.sensors.odometry import Trail
+from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
+from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.registry import make_model
+from tdanet_jax.poses import ROTATIONS
+from tdanet_jax.sensors import suite
+from tdanet_jax.sensors.detections import centre_and_area, merge_classes
+from tdanet_jax.sensors.sensor import Frame, Motion, Start
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import newest
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action, class_words
@@ -56,14 +56,13 @@ class Detection:
             raise ValueError(f"{self}: corners must be shares of the image, x1 <= x2 and y1 <= y2")
 
 
-class Memory(NamedTuple):
+class AgentState(NamedTuple):
     """What the agent carries from step to step of one episode."""
 
-    carry: Carry  # each [1, H]
-    previous: jax.Array  # [1, 6], action probabilities of the step before
-    action: jax.Array  # int32, the action before; 6 at the start
-    trail: Trail | None  # the way up to that action; if the network senses it
-    target: jax.Array  # int32, what it looked for in the step before; -1 at the start
+    recurrent: RecurrentState  # of the network, a batch of one
+    action: jax.Array  # int32, the previous action; 6 at the start
+    sensors: Mapping[str, Any]  # states of the sensors before that action
+    target: jax.Array  # int32, what it looked for in the previous step; -1 at the start
 
 
 class Decision(NamedTuple):
@@ -80,8 +79,8 @@ class Agent:
 
     Attributes:
       config: the training run's configuration.
-      classes: the training run's vocabulary. A model with a row per class sees objects of the
-        known classes alone; any other sees whatever has a name.
+      classes: the training run's vocabulary. A model with a row per class is shown objects of the
+        known classes alone; any other model is shown whatever has a name.
       model, weights: the network and its parameters.
     """
 
@@ -90,10 +89,10 @@ class Agent:
         config: TrainConfig,
         weights: Any,
         vectors: WordVectors,
-        classes: Classes | None = None,
+        classes: ClassVocabulary | None = None,
     ) -> None:
         self.config = config
-        self.classes = Classes() if classes is None else classes
+        self.classes = ClassVocabulary() if classes is None else classes
         self.model: ActorCritic = make_model(config, self.classes)
         self.weights = weights
         self._vectors = vectors
@@ -101,82 +100,78 @@ class Agent:
         self._table: Any = None
         self._decide = jax.jit(self._forward)
 
-    def start(self, rotation: float = 0, horizon: float = 0) -> Memory:
-        """The memory at the start of an episode.
+    def start(self, rotation: float = 0, horizon: float = 0) -> AgentState:
+        """The state at the start of an episode.
 
         Args:
-          rotation: degrees, a multiple of 45; multiples of 90 lie along the grid on which the agent
-            moves. Only networks that sense their way (`--odometry`) need it.
-          horizon: degrees, 0 or 30, looking down; likewise.
+          rotation: degrees clockwise, a multiple of 45; multiples of 90 lie along the grid on which
+            the agent moves. Only networks with sensors (`--odometry`) need it.
+          horizon: degrees down, 0 or 30; likewise.
 
         Raises:
-          ValueError: the rotation is no multiple of 45, or the horizon neither 0 nor 30.
+          ValueError: the rotation is not a multiple of 45, or the horizon neither 0 nor 30.
         """
         eighths = round(rotation / 45)
         if abs(rotation - 45 * eighths) > TOLERANCE:
             raise ValueError(f"rotation {rotation}: not a multiple of 45 degrees")
         if min(abs(horizon), abs(horizon - 30)) > TOLERANCE:
             raise ValueError(f"horizon {horizon}: neither 0 nor 30 degrees")
-        trail = None
-        if self.model.odometry:
-            diagonal, down = jnp.int32(eighths % 2), jnp.int32(horizon > 15)
-            trail = odometry.begin(diagonal, down, self.model.triangulation)
-        return Memory(
-            carry=self.model.initial_carry(1, self.weights),
-            previous=jnp.zeros((1, NUM_ACTIONS)),
+        start = Start(jnp.int32(eighths % ROTATIONS), jnp.int32(horizon > 15))
+        return AgentState(
+            recurrent=actor_critic.initial_state(self.model, self.weights, 1),
             action=jnp.int32(NUM_ACTIONS),
-            trail=trail,
+            sensors=suite.init(self.model.spec, start),
             target=jnp.int32(-1),
         )
 
     def act(
         self,
-        memory: Memory,
+        state: AgentState,
         detections: Sequence[Detection],
         target: str,
         key: jax.Array | None = None,
         blocked: bool | None = None,
-    ) -> tuple[Memory, Decision]:
+    ) -> tuple[AgentState, Decision]:
         """One step.
 
-        The memory takes it that the decision is carried out (else, replace its `action`), and that
-        a MoveAhead leads to the next point of the grid: 0.25 m on one axis, on both along a
-        diagonal. A network that senses its target's place (`--triangulation`) takes it that the
-        view is 90 degrees wide and high.
+        The returned state assumes that the decision is carried out (otherwise replace its
+        `action`), and that MoveAhead leads to the next point of the grid: 0.25 m along one axis, or
+        along both on a diagonal. With `--triangulation` the camera's field of view must be 90
+        degrees in both directions.
 
         Args:
-          memory: from `start` or the step before.
+          state: from `start` or the previous step.
           detections: the objects in view, in any order.
           target: what to look for, in English.
           key: samples the action, as in training; None takes the most probable one.
-          blocked: whether the agent did not move in the action before (AI2-THOR's
-            `lastActionSuccess` was False). Networks that sense their way need it behind a
-            MoveAhead, and behind no other action.
+          blocked: whether the previous action failed to move the agent (AI2-THOR's
+            `lastActionSuccess` was False). Networks with sensors need it after a MoveAhead, and
+            after no other action.
 
         Raises:
           KeyError: a label has a word without a word vector.
-          ValueError: the model looks at an image, and not at detections; or it senses its way and
-            is not told whether its MoveAhead was blocked.
+          ValueError: the model needs an image instead of detections; or it has sensors and is not
+            told whether its MoveAhead was blocked.
         """
         if self.model.encoder.IMAGE:
             raise ValueError(
-                f"{self.config.model} looks at an image; an agent is shown detections alone"
+                f"{self.config.model} needs an image; an agent is shown detections alone"
             )
-        if memory.trail is not None and blocked is None and memory.action == Action.MOVE_AHEAD:
-            raise ValueError("the agent senses its way: say whether its MoveAhead was `blocked`")
+        if self.model.spec.sensors and blocked is None and state.action == Action.MOVE_AHEAD:
+            raise ValueError("the agent has odometry: say whether its MoveAhead was `blocked`")
         obs, owner = self._observe(detections, target)
-        memory, out, attention = self._decide(
-            self.weights, self._prepared(), memory, obs, jnp.asarray(bool(blocked))
+        state, out, attention = self._decide(
+            self.weights, self._prepared(), state, obs, jnp.asarray(bool(blocked))
         )
         logits, value = out
         best = jnp.argmax(logits, -1) if key is None else jax.random.categorical(key, logits)
         decision = Decision(
             action=Action(int(best[0])),
-            probabilities=np.asarray(memory.previous[0]),
+            probabilities=np.asarray(state.recurrent.prev_action_probs[0]),
             value=float(value[0]),
             attention=None if attention is None else np.asarray(attention[0])[owner],
         )
-        return memory._replace(action=best[0]), decision
+        return state._replace(action=best[0]), decision
 
     def knows(self, label: str) -> bool:
         """Whether a label has a word vector, so that it can be detected or looked for."""
@@ -191,7 +186,7 @@ class Agent:
         """
         labels = np.array([self._index(d.label) for d in detections], np.int32)
         corners = np.array([(d.x1, d.y1, d.x2, d.y2) for d in detections]).reshape(-1, 4)
-        if (self.model.encoder.ROWS or self.config.network.rows) == "class":
+        if self.model.spec.rows == "class":
             labels, owner = np.unique(labels, return_inverse=True)
             order = np.argsort(owner, kind="stable")
             _, found = merge_classes(owner[order], corners[order])
@@ -229,23 +224,26 @@ class Agent:
         return self._table
 
     def _forward(
-        self, weights: Any, table: Any, memory: Memory, obs: Observation, blocked: jax.Array
-    ) -> tuple[Memory, Output, jax.Array | None]:
-        """What the network says and attends to, and the memory behind it but for the action."""
-        trail = memory.trail
-        if trail is not None:
-            trail = odometry.follow(trail, memory.action, blocked)
-            is_target = obs.mask[0] & (obs.classes[0] == obs.target[0])
-            trail = odometry.forget(trail, memory.target != obs.target[0])
-            trail = odometry.look(trail, obs.boxes[0], is_target)
-            obs = obs.replace(odometry=jax.tree.map(lambda x: x[None], odometry.sense(trail)))
-        variables = {"params": weights}
-        attention: Any = self.model.apply(variables, table, obs, method="attention")
-        carry, out = actor_critic.forward(
-            self.model, weights, table, memory.carry, obs, memory.previous, jnp.zeros(1, bool)
-        )
-        previous = jax.nn.softmax(out.logits)
-        return Memory(carry, previous, memory.action, trail, obs.target[0]), out, attention
+        self,
+        weights: Any,
+        class_table: Any,
+        state: AgentState,
+        obs: Observation,
+        blocked: jax.Array,
+    ) -> tuple[AgentState, Output, jax.Array | None]:
+        """The state but for the next action, policy and value, and the attention."""
+        spec = self.model.spec
+        frame = Frame(obs.classes[0], obs.boxes[0], obs.mask[0], obs.target[0])
+        sensors = suite.update(spec, state.sensors, Motion(state.action, blocked))
+        sensors = suite.clear(spec, sensors, state.target != frame.target)
+        sensors = suite.observe(spec, sensors, frame)
+        readings = jax.tree.map(lambda x: x[None], suite.read(spec, sensors))
+        recurrent, out, kept = actor_critic.act(
+            self.model, weights, class_table, state.recurrent, obs.replace(sensors=readings),
+            collections=("intermediates",),
+        )  # fmt: skip
+        (attention,) = kept["intermediates"]["attention"]
+        return AgentState(recurrent, state.action, sensors, frame.target), out, attention
 
 
 def load(run: Path | str) -> Agent:
@@ -262,7 +260,7 @@ def load(run: Path | str) -> Agent:
     return Agent(config, weights, vectors, classes)
 
 
-def read(run: Path | str) -> tuple[TrainConfig, Any, Classes]:
+def read(run: Path | str) -> tuple[TrainConfig, Any, ClassVocabulary]:
     """What `load` makes an agent of: configuration, parameters, vocabulary."""
     path = Path(run)
     point = path.suffix == history.SUFFIX

@@ -1,8 +1,8 @@
-"""What a network attends to: Eq. 1 and 2 in any state, and the mean over pairs of classes.
+"""What a network attends to: Eq. 1 and 2 in any state, and means over pairs of classes.
 
 Correspondence is the inner product of a detection's row and the target's, both through W_L;
-attention is its softmax over the detections in view (Eq. 1). The difference is what the Siamese
-comparison leaves between the attended detection and the target (Eq. 2).
+attention is its softmax over the detections in view (Eq. 1). The difference is the absolute
+difference of the attended detection and the target in the Siamese comparison (Eq. 2).
 """
 
 from __future__ import annotations
@@ -19,52 +19,43 @@ import jax.numpy as jnp
 import numpy as np
 
 from tdanet_jax.env import dynamics
-from tdanet_jax.env.dynamics import EnvParams, Observation
-from tdanet_jax.models.actor_critic import ActorCritic, Output
-from tdanet_jax.models.layers import Carry
-from tdanet_jax.vocabulary import NUM_ACTIONS
+from tdanet_jax.env.types import EnvParams, Observation
+from tdanet_jax.models import actor_critic
+from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
 
-#: Frames that one compiled call looks at.
+#: Frames in one compiled call.
 BATCH = 1024
 
 
-class Look(NamedTuple):
-    """What a network makes of a batch of frames [B]; None where it has no such thing."""
+class FrameAttention(NamedTuple):
+    """The values of Eq. 1 and 2 in a batch of frames [B]; None where the model has none."""
 
     attention: jax.Array | None  # [B, K], weight of each detection, 0 in padding
-    correspondence: jax.Array | None  # [B, K], attention before the softmax; junk in padding
+    correspondence: jax.Array | None  # [B, K], attention before the softmax; undefined in padding
     difference: jax.Array | None  # [B, H], |attended detection - target|
 
 
-def forward(
-    model: ActorCritic,
-    weights: Any,
-    table: Any,
-    carry: Carry,
-    obs: Observation,
-    previous: jax.Array,
-    fresh: jax.Array,
-) -> tuple[Carry, Output, Look]:
-    """`actor_critic.forward` of one step, and the values of Eq. 1 and 2 on its way."""
-    variables = {"params": weights}
-    (carry, out), kept = model.apply(
-        variables, table, carry, obs, previous, fresh, mutable=["intermediates"]
+def act(
+    model: ActorCritic, weights: Any, class_table: Any, state: RecurrentState, obs: Observation
+) -> tuple[RecurrentState, Output, FrameAttention]:
+    """`actor_critic.act`, with the values of Eq. 1 and 2 on its way."""
+    state, out, kept = actor_critic.act(
+        model, weights, class_table, state, obs, collections=("intermediates",)
     )
-    inside = kept.get("intermediates", {}).get("encoder", {})
-    attention: Any = model.apply(variables, table, obs, method="attention")
-    values = (inside[name][0] if name in inside else None for name in Look._fields[1:])
-    return carry, out, Look(attention, *values)
+    inside = kept["intermediates"].get("encoder", {})
+    values = (inside[name][0] if name in inside else None for name in FrameAttention._fields[1:])
+    return state, out, FrameAttention(kept["intermediates"]["attention"][0], *values)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def look(
+def attend(
     model: ActorCritic,
     weights: Any,
     words: jax.Array,
-    params: EnvParams,
     pose: jax.Array,
     target: jax.Array,
-) -> tuple[Observation, Look]:
+    params: EnvParams,
+) -> tuple[Observation, FrameAttention]:
     """Eq. 1 and 2 in any states.
 
     Args:
@@ -72,15 +63,13 @@ def look(
       pose: [B] int32. target: [B] int32, index among the tables' targets.
 
     Returns:
-      What is in view, and what the network makes of it. Neither depends on earlier steps.
+      The observations and their attention. Neither depends on earlier steps.
     """
-    from_table = model.apply({"params": weights}, words, method="prepare")
-    state = jax.vmap(dynamics.start, (None, 0, 0))(params, pose, target)
-    obs = jax.vmap(dynamics.observe, (0, None))(state, params)
-    count = pose.shape[0]
-    blank, fresh = jnp.zeros((count, NUM_ACTIONS)), jnp.ones(count, bool)
-    carry = model.initial_carry(count, weights)
-    return obs, forward(model, weights, from_table, carry, obs, blank, fresh)[2]
+    class_table = actor_critic.prepare(model, weights, words)
+    begun = jax.vmap(dynamics.start, (0, 0, None))(pose, target, params)
+    obs = jax.vmap(dynamics.observe, (0, None))(begun, params)
+    state = actor_critic.initial_state(model, weights, pose.shape[0])
+    return obs, act(model, weights, class_table, state, obs)[2]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +77,7 @@ class ClassPairs:
     """Mean attention on each class while looking for each target.
 
     The target's own class counts in frames with the target in view, every other class in frames
-    without it: there it shows what an agent goes by that does not see the target yet.
+    without it: there it shows what guides an agent before it sees the target.
 
     Attributes:
       targets: G names. classes: C names.
@@ -126,16 +115,16 @@ def class_pairs(
     model: ActorCritic,
     weights: Any,
     words: jax.Array,
-    params: EnvParams,
     pose: np.ndarray,
     target: np.ndarray,
+    params: EnvParams,
     targets: Sequence[str],
     classes: Sequence[str],
 ) -> ClassPairs:
     """Mean attention by class pair over frames.
 
     Args:
-      pose: [N] int, target: [N] int, of each frame. Repeated ones are looked at once and counted
+      pose: [N] int, target: [N] int, of each frame. Repeated frames are computed once and counted
         as often as they occur.
       targets, classes: the tables' names.
 
@@ -150,7 +139,7 @@ def class_pairs(
         weight = np.zeros(BATCH, np.float32)  # 0 in the padding of the last batch
         weight[: len(part)] = count[first : first + BATCH]
         padded = np.resize(part, (BATCH, 2))
-        more = _sum_pairs(model, shape, weights, words, params, *padded.T, weight)
+        more = _sum_pairs(model, shape, weights, words, *padded.T, params, weight)
         if more is None:
             raise ValueError("this network has no attention")
         sums += np.asarray(more, np.float64)
@@ -165,13 +154,13 @@ def _sum_pairs(
     shape: tuple[int, int],
     weights: Any,
     words: jax.Array,
-    params: EnvParams,
     pose: jax.Array,
     target: jax.Array,
+    params: EnvParams,
     count: jax.Array,
 ) -> jax.Array | None:
     """Sums over frames [3, G, C]: class in view, its attention, its share of the detections."""
-    obs, seen = look(model, weights, words, params, pose, target)
+    obs, seen = attend(model, weights, words, pose, target, params)
     if seen.attention is None:
         return None
     frame = jnp.arange(pose.shape[0])[:, None]
@@ -184,7 +173,7 @@ def _sum_pairs(
     ones = obs.mask.astype(jnp.float32)
     number = by_class(ones)
     even = number / jnp.maximum(ones.sum(-1, keepdims=True), 1)
-    # Where the target is in view, the others are not what there is to go by.
+    # Where the target is in view, other classes do not count.
     own = jnp.arange(shape[1]) == obs.target[:, None]
     found = jnp.any(own & (number > 0), axis=-1, keepdims=True)
     counts = (number > 0) & (own | ~found)

@@ -1,8 +1,8 @@
-"""An episode step by step: where an agent went, what was in view, and what its network made of it.
+"""An episode step by step: the agent's path, what was in view, and what its network computed.
 
-A trace is made from actions that were already taken, be it by `evaluation.evaluate` or read from a
-run's `episodes.jsonl`: they lead through the same poses again, and the network is asked at each of
-them, with the memory that it had there. So a recorded episode is shown as it happened.
+A trace is made from actions that were already taken, by `rollout.evaluate` or as read from a run's
+`episodes.jsonl`: they lead through the same poses again, and the network runs at each of them with
+the recurrent state that it had there. So a recorded episode is shown as it happened.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tdanet_jax import poses
 from tdanet_jax.agent import agent
 from tdanet_jax.analysis import attention
 from tdanet_jax.env import dynamics
-from tdanet_jax.env.dynamics import EnvParams, EnvState
+from tdanet_jax.env.types import EnvParams, EnvState
 from tdanet_jax.evaluation import policies, rollout
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.policies import Policy
@@ -30,7 +30,7 @@ from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.task import Task, task_in
-from tdanet_jax.vocabulary import NUM_ACTIONS, Action
+from tdanet_jax.vocabulary import Action
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Player:
 
     Attributes:
       name: what pictures call it.
-      task: the rooms as its configuration shows them.
+      task: the rooms, as its configuration shows them.
       model, weights: the network, or None.
       greedy: takes the most probable action instead of sampling one.
     """
@@ -63,8 +63,8 @@ class Player:
         if self.model is None:
             return False
         one, task = jnp.zeros(1, jnp.int32), self.task
-        arguments = (self.weights, task.words, task.eval_params, one, one)
-        shapes = jax.eval_shape(functools.partial(attention.look, self.model), *arguments)
+        arguments = (self.weights, task.words, one, one, task.eval_params)
+        shapes = jax.eval_shape(functools.partial(attention.attend, self.model), *arguments)
         return shapes[1].attention is not None
 
 
@@ -75,9 +75,8 @@ def load_player(run: Path | str, rooms: Rooms, greedy: bool = False) -> Player:
       A player with the name of the run's folder, or of the point.
 
     Raises:
-      ValueError: the folder holds no run, its checkpoint cannot be read, the network looks at
-        feature maps that the rooms do not have, or it knows classes by number and the rooms have
-        others.
+      ValueError: the folder holds no run, its checkpoint cannot be read, the network needs feature
+        maps that the rooms do not have, or it knows classes by index and the rooms have others.
     """
     config, weights, classes = agent.read(run)
     task = task_in(rooms, config)
@@ -87,7 +86,7 @@ def load_player(run: Path | str, rooms: Rooms, greedy: bool = False) -> Player:
 
 @dataclasses.dataclass(frozen=True)
 class Trace:
-    """One player's episode of T actions. What a player does not have is None.
+    """One player's episode of T actions. Fields that a player does not have are None.
 
     Attributes:
       player: its name.
@@ -98,8 +97,8 @@ class Trace:
       shortest: L, actions on the optimal path with Done.
       probabilities: [T, 6], of the actions.
       value: [T], expected discounted return.
-      attention: T arrays [n], weight of each of the n objects in view, in the tables' order. Where
-        the network sees a row per class, every object of the class has the row's weight.
+      attention: T arrays [n], weight of each of the n objects in view, in the tables' order. For
+        a network with a row per class, every object of the class has the row's weight.
       correspondence: the same, before the softmax of Eq. 1.
       difference: [T], mean over the units of Eq. 2's absolute difference.
     """
@@ -135,7 +134,7 @@ class View(NamedTuple):
 
     classes: tuple[str, ...]
     boxes: np.ndarray  # [n, 4] x1, y1, x2, y2 as shares of the image, y down
-    within_reach: np.ndarray  # [n] bool, visible as the task says it: within 1.5 m
+    within_reach: np.ndarray  # [n] bool, visible in the sense of the task: within 1.5 m
 
 
 def view(tables: SceneTables, pose: int) -> View:
@@ -149,7 +148,7 @@ def view(tables: SceneTables, pose: int) -> View:
 
 
 def _detected(tables: SceneTables, pose: int) -> np.ndarray:
-    """The tables' rows of a pose that are detections; what is visible without a box is none."""
+    """The tables' rows of a pose that are detections: those with a box."""
     rows = np.arange(tables.row_start[pose], tables.row_start[pose + 1])
     return rows[tables.row_box[rows, 0] >= 0]
 
@@ -163,7 +162,7 @@ def play(player: Player, tables: SceneTables, episode: Episodes, seed: int = 0) 
 
 def retrace(player: Player, tables: SceneTables, episode: Episodes, actions: np.ndarray) -> Trace:
     """The trace of actions [T] that were taken in an episode."""
-    pose = follow(player.task.eval_params, episode, actions[None])[0]
+    pose = follow(episode, actions[None], player.task.eval_params)[0]
     goal = int(episode.target[0])
     trace = Trace(
         player=player.name,
@@ -174,20 +173,20 @@ def retrace(player: Player, tables: SceneTables, episode: Episodes, actions: np.
         success=bool(actions[-1] == Action.DONE and tables.distance[pose[-1], goal] == 0),
         shortest=int(tables.distance[pose[0], goal]) + 1,
     )
-    return trace if player.model is None else _think(player, tables, trace, goal)
+    return trace if player.model is None else _with_network(player, tables, trace, goal)
 
 
-def follow(params: EnvParams, episodes: Episodes, actions: np.ndarray) -> np.ndarray:
+def follow(episodes: Episodes, actions: np.ndarray, params: EnvParams) -> np.ndarray:
     """Poses [E, N + 1] before each of the actions [E, N] and at the end; -1 is no action."""
-    return np.asarray(_follow(params, jnp.asarray(episodes.pose), jnp.asarray(actions)))
+    return np.asarray(_follow(jnp.asarray(episodes.pose), jnp.asarray(actions), params))
 
 
 @jax.jit
-def _follow(params: EnvParams, pose: jax.Array, actions: jax.Array) -> jax.Array:
-    move = jax.vmap(dynamics.move, (None, 0, 0))
+def _follow(pose: jax.Array, actions: jax.Array, params: EnvParams) -> jax.Array:
+    move = jax.vmap(dynamics.move, (0, 0, None))
 
     def step(pose: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
-        after = jnp.where(action < 0, pose, move(params, pose, action))
+        after = jnp.where(action < 0, pose, move(pose, action, params))
         return after, after
 
     _, after = jax.lax.scan(step, pose, actions.T)
@@ -195,11 +194,11 @@ def _follow(params: EnvParams, pose: jax.Array, actions: jax.Array) -> jax.Array
 
 
 def visited(
-    params: EnvParams, episodes: Episodes, records: Records
+    episodes: Episodes, records: Records, params: EnvParams
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pose and target [N] of every frame in which an action was chosen."""
     taken = records.actions >= 0
-    pose = follow(params, episodes, records.actions)[:, :-1][taken]
+    pose = follow(episodes, records.actions, params)[:, :-1][taken]
     return pose, np.repeat(episodes.target, taken.sum(axis=1))
 
 
@@ -207,15 +206,15 @@ def visited(
 STEP_BLOCK = 200
 
 
-def _think(player: Player, tables: SceneTables, trace: Trace, goal: int) -> Trace:
-    """The trace with what the network made of every step."""
+def _with_network(player: Player, tables: SceneTables, trace: Trace, goal: int) -> Trace:
+    """The trace with what the network computed in every step."""
     count = len(trace.actions)
     padded = np.resize(trace.actions, -(-count // STEP_BLOCK) * STEP_BLOCK)
     task, pose = player.task, jnp.asarray(trace.pose[0])
-    start = dynamics.start(task.eval_params, pose, jnp.int32(goal))
-    thoughts = _thoughts(player.model, player.weights, task.words, task.eval_params, start, padded)
-    steps = jax.tree.map(lambda x: np.asarray(x, np.float64)[:count], thoughts)
-    rows = [_rows_of_objects(task.eval_params, tables, pose) for pose in trace.pose[:-1]]
+    start = dynamics.start(pose, jnp.int32(goal), task.eval_params)
+    outputs = _network(player.model, player.weights, task.words, start, padded, task.eval_params)
+    steps = jax.tree.map(lambda x: np.asarray(x, np.float64)[:count], outputs)
+    rows = [_rows_of_objects(tables, pose, task.eval_params) for pose in trace.pose[:-1]]
 
     def by_object(values: np.ndarray | None) -> tuple[np.ndarray, ...] | None:
         if values is None:
@@ -232,7 +231,7 @@ def _think(player: Player, tables: SceneTables, trace: Trace, goal: int) -> Trac
     )
 
 
-def _rows_of_objects(params: EnvParams, tables: SceneTables, pose: int) -> np.ndarray:
+def _rows_of_objects(tables: SceneTables, pose: int, params: EnvParams) -> np.ndarray:
     """The observation's row of each of the n objects in view: [n] int."""
     classes = tables.row_class[_detected(tables, pose)]
     if int(params.row_start[pose + 1] - params.row_start[pose]) == len(classes):
@@ -240,8 +239,8 @@ def _rows_of_objects(params: EnvParams, tables: SceneTables, pose: int) -> np.nd
     return np.unique(classes, return_inverse=True)[1]  # rows are one a class, in the same order
 
 
-class _Thoughts(NamedTuple):
-    """What a network makes of each step [N]."""
+class _NetworkSteps(NamedTuple):
+    """What a network computes in each step [N]."""
 
     probabilities: jax.Array  # [N, 6]
     value: jax.Array  # [N]
@@ -251,28 +250,29 @@ class _Thoughts(NamedTuple):
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _thoughts(
+def _network(
     model: ActorCritic,
     weights: Any,
     words: jax.Array,
-    params: EnvParams,
     start: EnvState,
     actions: jax.Array,
-) -> _Thoughts:
-    table = actor_critic.prepare(model, weights, words)
+    params: EnvParams,
+) -> _NetworkSteps:
+    class_table = actor_critic.prepare(model, weights, words)
 
-    def step(memory: tuple, action: jax.Array) -> tuple[tuple, _Thoughts]:
-        state, carry, previous, fresh = memory
+    def step(loop: tuple, action: jax.Array) -> tuple[tuple, _NetworkSteps]:
+        state, recurrent = loop
         obs = jax.tree.map(lambda x: x[None], dynamics.observe(state, params))
-        carry, out, look = attention.forward(model, weights, table, carry, obs, previous, fresh)
-        probabilities = jax.nn.softmax(out.logits)
-        difference = None if look.difference is None else look.difference.mean(-1)
-        thoughts = _Thoughts(
-            probabilities, out.value, look.attention, look.correspondence, difference
+        recurrent, out, frame = attention.act(model, weights, class_table, recurrent, obs)
+        computed = _NetworkSteps(
+            probabilities=recurrent.prev_action_probs,
+            value=out.value,
+            attention=frame.attention,
+            correspondence=frame.correspondence,
+            difference=None if frame.difference is None else frame.difference.mean(-1),
         )
         state = dynamics.transition(state, action, params).state
-        memory = state, carry, probabilities, jnp.zeros_like(fresh)
-        return memory, jax.tree.map(lambda x: x[0], thoughts)
+        return (state, recurrent), jax.tree.map(lambda x: x[0], computed)
 
-    carry, previous = model.initial_carry(1, weights), jnp.zeros((1, NUM_ACTIONS))
-    return jax.lax.scan(step, (start, carry, previous, jnp.ones(1, bool)), actions)[1]
+    loop = start, actor_critic.initial_state(model, weights, 1)
+    return jax.lax.scan(step, loop, actions)[1]

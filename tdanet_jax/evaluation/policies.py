@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from tdanet_jax.env import dynamics
-from tdanet_jax.env.dynamics import EnvParams, EnvState
+from tdanet_jax.env.types import EnvParams, EnvState
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action
@@ -18,7 +18,7 @@ from tdanet_jax.vocabulary import NUM_ACTIONS, Action
 class Policy(NamedTuple):
     """How to act in a batch of B episodes.
 
-    `start(weights, batch)` gives the memory at the start of the episodes, and
+    `start(weights, batch)` gives the policy's memory at the start of the episodes, and
     `act(weights, memory, key, state, params)` the memory and the actions [B] of the next step.
     """
 
@@ -38,13 +38,13 @@ def random() -> Policy:
 
 
 def shortest_path() -> Policy:
-    """Goes down the table of distances and says Done as soon as the target is visible."""
-    move = jax.vmap(jax.vmap(dynamics.move, (None, None, 0)), (None, 0, None))
+    """Descends the table of distances and says Done as soon as the target is visible."""
+    move = jax.vmap(jax.vmap(dynamics.move, (None, 0, None)), (0, None, None))
 
     def act(
         weights: Any, memory: Any, key: jax.Array, state: EnvState, params: EnvParams
     ) -> tuple[Any, jax.Array]:
-        poses = move(params, state.pose, jnp.arange(NUM_ACTIONS))  # [B, 6]
+        poses = move(state.pose, jnp.arange(NUM_ACTIONS), params)  # [B, 6]
         distance = params.distance[poses, state.target[:, None]].astype(jnp.int32)
         far = jnp.iinfo(jnp.int32).max
         distance = jnp.where(distance < 0, far, distance).at[:, Action.DONE].set(far)
@@ -59,19 +59,17 @@ def network(model: ActorCritic, words: jax.Array, greedy: bool = False) -> Polic
     observe = jax.vmap(dynamics.observe, (0, None))
 
     def start(weights: Any, batch: int) -> Any:
-        table = actor_critic.prepare(model, weights, words)
-        previous, fresh = jnp.zeros((batch, NUM_ACTIONS)), jnp.ones(batch, bool)
-        return table, model.initial_carry(batch, weights), previous, fresh
+        class_table = actor_critic.prepare(model, weights, words)
+        return class_table, actor_critic.initial_state(model, weights, batch)
 
     def act(
         weights: Any, memory: Any, key: jax.Array, state: EnvState, params: EnvParams
     ) -> tuple[Any, jax.Array]:
-        table, carry, previous, fresh = memory
+        class_table, recurrent = memory
         obs = observe(state, params)
-        carry, out = actor_critic.forward(model, weights, table, carry, obs, previous, fresh)
+        recurrent, out, _ = actor_critic.act(model, weights, class_table, recurrent, obs)
         sampled = jax.random.categorical(key, out.logits)
         action = jnp.argmax(out.logits, axis=-1) if greedy else sampled
-        probs = jax.nn.softmax(out.logits)
-        return (table, carry, probs, jnp.zeros_like(fresh)), action
+        return (class_table, recurrent), action
 
     return Policy(start, act)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tdanet_jax.env import dynamics
-from tdanet_jax.env.dynamics import EnvParams
+from tdanet_jax.env.types import EnvParams
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.policies import Policy
 
@@ -123,7 +123,7 @@ def _play(
 ) -> tuple[jax.Array, ...]:
     count = pose.shape[0]
     transition = jax.vmap(dynamics.transition, (0, 0, None))
-    state = jax.vmap(dynamics.start, (None, 0, 0))(params, pose, target)
+    state = jax.vmap(dynamics.start, (0, 0, None))(pose, target, params)
 
     def unfinished(loop: tuple) -> jax.Array:
         step, _, _, alive, _, _ = loop

@@ -129,7 +129,7 @@ def share(run: Path, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     history.save(out / history.NETWORK, network.load(), half=True)
     configs.save(network.config, out / CONFIG_FILE)
-    classes.load(run).save(out)
+    classes.load_vocabulary(run).save(out)
     for name in (report.RESULTS_PAGE, report.EPISODES_FILE, report.RESULTS_FILE):
         if (run / name).is_file():
             shutil.copyfile(run / name, out / name)
@@ -193,7 +193,7 @@ def _checked(network: Saved, task: Task) -> Snapshot:
             f"{network.point or network.run}: trained on scene tables {snapshot.data_version}, "
             f"these are {task.tables.data_version}"
         )
-    task.check_known(network.run, classes.load(network.run).names)
+    task.check_known(network.run, classes.load_vocabulary(network.run).names)
     return snapshot
 
 
@@ -211,6 +211,6 @@ def _provenance(
         data_version=task.tables.data_version,
         data=network.rooms,
         image=task.image,
-        odometry=task.model.odometry,
-        triangulation=task.model.triangulation,
+        odometry="odometry" in task.spec.sensors,
+        triangulation="triangulation" in task.spec.sensors,
     )

@@ -2,27 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from flax import struct
 
-from tdanet_jax.env.dynamics import FEATURES, RASTER, Observation
+from tdanet_jax.env.types import FEATURES, RASTER, Observation
+from tdanet_jax.models.activation_cache import ACTIVATIONS
 from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.layers import LSTM, TAPE, Carry, Linear
-from tdanet_jax.sensors.odometry import numbers, sensed_at_start
+from tdanet_jax.models.layers import Linear
+from tdanet_jax.models.lstm import LSTM, Carry
+from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.sensors import suite
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
-#: Units of the layer that reads the odometry.
-ODOMETRY_UNITS = 64
+#: Units of the layer that embeds the sensors' features.
+SENSOR_UNITS = 64
 
 
 class Output(NamedTuple):
-    """What the network says about a batch of states."""
+    """Policy and value in a batch of states."""
 
     logits: jax.Array  # [..., 6], unnormalised log-probabilities of the actions
     value: jax.Array  # [...], expected discounted return
+
+
+class RecurrentState(struct.PyTreeNode):
+    """What a network carries from step to step in B environments."""
+
+    carry: Any  # of the LSTM: hidden and cell, each [B, H]; adaptive networks carry more
+    prev_action_probs: jax.Array  # [B, 6], action probabilities of the previous step; 0 at first
+    is_first: jax.Array  # [B] bool, the episode has just begun
+
+    def restarted(self, done: jax.Array) -> RecurrentState:
+        """The state with a new episode in the environments that are `done` [B] bool."""
+        probs = jnp.where(done[:, None], 0.0, self.prev_action_probs)
+        return self.replace(prev_action_probs=probs, is_first=done)
 
 
 class ActorCritic(nn.Module):
@@ -33,23 +51,19 @@ class ActorCritic(nn.Module):
       hidden: units of the LSTM.
       action_width: units of the embedding of the previous action probabilities.
       dtype: operands of the LSTM's products.
-      odometry: whether the agent senses its own way (`Observation.odometry`), which a layer of
-        `ODOMETRY_UNITS` then adds to the features. Not the paper's.
-      triangulation: whether it senses its target's place, too (`Odometry.target`).
+      spec: what the agent is shown. A layer of `SENSOR_UNITS` adds the sensors' features to the
+        encoder's; the paper's agent has no sensors.
     """
 
     encoder: Encoder
     hidden: int = 512
     action_width: int = 10
     dtype: Any = jnp.float32
-    odometry: bool = False
-    triangulation: bool = False
+    spec: ObservationSpec = ObservationSpec()
 
     def setup(self) -> None:
-        if self.triangulation and not self.odometry:
-            raise ValueError("a network that senses its target's place senses its way, too")
-        if self.odometry:
-            self.way = Linear(ODOMETRY_UNITS)
+        if self.spec.sensors:
+            self.sensor_embedding = Linear(SENSOR_UNITS)
         if self.encoder.ACTION != "plain":
             self.action_embedding = Linear(self.action_width)
         self.lstm = LSTM(self.hidden, self.dtype)
@@ -63,52 +77,54 @@ class ActorCritic(nn.Module):
 
     def __call__(
         self,
-        table: Any,
+        class_table: Any,
         carry: Carry,
         obs: Observation,
-        previous: jax.Array,
-        fresh: jax.Array,
-        keep: jax.Array | None = None,
+        prev_action_probs: jax.Array,
+        is_first: jax.Array,
+        dropout_mask: jax.Array | None = None,
     ) -> tuple[Carry, Output]:
         """One step for a batch [B], or a rollout [T, B].
 
         Args:
-          table: from `prepare`.
+          class_table: from `prepare`.
           carry: recurrent state before the (first) step, each [B, H].
           obs: observations.
-          previous: [..., 6] action probabilities of the previous step; zeros where fresh.
-          fresh: [...] bool, True where an episode starts.
-          keep: [..., units] bool, units that dropout keeps; None when not training.
+          prev_action_probs: [..., 6], of the previous step; zeros where an episode starts.
+          is_first: [...] bool, True where an episode starts.
+          dropout_mask: [..., units] bool, units that dropout keeps; None when not training.
         """
-        features, aside = self.perceive(table, obs, previous, keep)
-        carry, hidden = self.lstm(carry, features, aside, fresh)
+        features, skip_inputs = self.perceive(class_table, obs, prev_action_probs, dropout_mask)
+        if self.is_mutable_collection("intermediates"):
+            self.sow("intermediates", "attention", self.encoder.attend(class_table, obs))
+        carry, hidden = self.lstm(carry, features, skip_inputs, is_first)
         return carry, self.decide(hidden)
 
     def perceive(
-        self, table: Any, obs: Observation, previous: jax.Array, keep: jax.Array | None
+        self,
+        class_table: Any,
+        obs: Observation,
+        prev_action_probs: jax.Array,
+        dropout_mask: jax.Array | None,
     ) -> tuple[jax.Array, jax.Array]:
-        """The inputs of the LSTM: features [..., n], and the few `aside` [..., m]."""
-        action = previous
+        """The inputs of the LSTM: features [..., n], and a few `skip_inputs` [..., m]."""
+        action = prev_action_probs
         if self.encoder.ACTION != "plain":
-            action = nn.relu(self.action_embedding(previous))
-        features = self.encoder(table, obs, action, keep)
-        if self.odometry:
-            if obs.odometry is None:
-                raise ValueError("the network senses its way, and the observations do not hold it")
-            way = nn.relu(self.way(numbers(obs.odometry)))
-            features = jnp.concatenate([features, way], axis=-1)
+            action = nn.relu(self.action_embedding(prev_action_probs))
+        features = self.encoder(class_table, obs, action, dropout_mask)
+        if self.spec.sensors:
+            if missing := [name for name in self.spec.sensors if name not in obs.sensors]:
+                raise ValueError(f"the observations lack what the network senses: {missing}")
+            sensed = self.sensor_embedding(suite.features(self.spec, obs.sensors))
+            features = jnp.concatenate([features, nn.relu(sensed)], axis=-1)
         return features, action[..., :0] if self.encoder.ACTION == "inside" else action
 
     def decide(self, hidden: jax.Array) -> Output:
         """Policy and value, from hidden states [..., H]."""
         return Output(self.actor(hidden), self.critic(hidden)[..., 0])
 
-    def attention(self, table: Any, obs: Observation) -> jax.Array | None:
-        """The encoder's weights over the detections, [..., K]; None if it has none."""
-        return self.encoder.attend(table, obs)
-
     def initial_carry(self, batch: int, weights: Any, training: bool = False) -> Any:
-        """The recurrent state at the start of an episode: zeros.
+        """The carry at the start of an episode: zeros.
 
         Args:
           batch: B.
@@ -118,11 +134,11 @@ class ActorCritic(nn.Module):
         return jnp.zeros((batch, self.hidden)), jnp.zeros((batch, self.hidden))
 
     def begin_rollout(self, carry: Any) -> Any:
-        """The recurrent state that a rollout begins with, from that behind the one before."""
+        """The carry that a rollout begins with, from that after the previous one."""
         return carry
 
     def blank(self, batch: int) -> Observation:
-        """Observations of nothing."""
+        """Observations without any detection."""
         return Observation(
             classes=jnp.zeros((batch, 1), jnp.int32),
             boxes=jnp.zeros((batch, 1, 3)),
@@ -131,17 +147,17 @@ class ActorCritic(nn.Module):
             empty=jnp.ones(batch, bool),
             cells=jnp.full((batch, *RASTER), -1, jnp.int32) if self.encoder.IMAGE else None,
             features=jnp.zeros((batch, *FEATURES), jnp.float16) if self.encoder.maps else None,
-            odometry=sensed_at_start(batch, self.triangulation) if self.odometry else None,
+            sensors=suite.blank(self.spec, batch),
         )
 
     def initialise(self, key: jax.Array, words: jax.Array) -> Any:
-        """Fresh parameters for word vectors [C, D]."""
+        """Random initial parameters for word vectors [C, D]."""
 
         def everything(module: ActorCritic) -> Output:
-            previous, fresh = jnp.zeros((1, NUM_ACTIONS)), jnp.ones((1,), bool)
-            table = module.prepare(words)
+            probs, is_first = jnp.zeros((1, NUM_ACTIONS)), jnp.ones((1,), bool)
+            class_table = module.prepare(words)
             carry = jnp.zeros((1, module.hidden)), jnp.zeros((1, module.hidden))
-            return module(table, carry, module.blank(1), previous, fresh)[1]
+            return module(class_table, carry, module.blank(1), probs, is_first)[1]
 
         return nn.init(everything, self)(key)["params"]
 
@@ -151,34 +167,58 @@ def prepare(model: ActorCritic, weights: Any, words: jax.Array) -> Any:
     return model.apply({"params": weights}, words, method="prepare")
 
 
+def initial_state(
+    model: ActorCritic, weights: Any, batch: int, training: bool = False
+) -> RecurrentState:
+    """The recurrent state at the start of `batch` episodes; `training` if units will be dropped."""
+    return RecurrentState(
+        carry=model.initial_carry(batch, weights, training),
+        prev_action_probs=jnp.zeros((batch, NUM_ACTIONS)),
+        is_first=jnp.ones(batch, bool),
+    )
+
+
+def act(
+    model: ActorCritic,
+    weights: Any,
+    class_table: Any,
+    state: RecurrentState,
+    obs: Observation,
+    dropout_mask: jax.Array | None = None,
+    collections: Collection[str] = (),
+) -> tuple[RecurrentState, Output, Any]:
+    """One step of a batch of B environments; everything that acts goes through here.
+
+    Args:
+      collections: Flax collections to return: `ACTIVATIONS` while training, "intermediates" for the
+        attention and the values of Eq. 1 and 2.
+
+    Returns:
+      The state after the step, policy and value, and the collections by name.
+    """
+    inputs = (class_table, state.carry, obs, state.prev_action_probs, state.is_first, dropout_mask)
+    (carry, out), kept = model.apply({"params": weights}, *inputs, mutable=list(collections))
+    after = RecurrentState(carry, jax.nn.softmax(out.logits), jnp.zeros_like(state.is_first))
+    return after, out, kept
+
+
 def forward(
     model: ActorCritic,
     weights: Any,
-    table: Any,
-    carry: Carry,
+    class_table: Any,
+    carry: Any,
     obs: Observation,
-    previous: jax.Array,
-    fresh: jax.Array,
-    keep: jax.Array | None = None,
+    prev_action_probs: jax.Array,
+    is_first: jax.Array,
+    dropout_mask: jax.Array | None = None,
     tape: Any = None,
-) -> tuple[Carry, Output]:
-    """`ActorCritic.__call__` with these weights; with a `tape`, products are taken from there."""
-    variables = {"params": weights} if tape is None else {"params": weights, TAPE: tape}
-    out: Any = model.apply(variables, table, carry, obs, previous, fresh, keep)
+) -> tuple[Any, Output]:
+    """`ActorCritic.__call__` with these weights, for a step or a whole rollout.
+
+    Args:
+      tape: what `act` has recorded in the same rollout; its products are taken from there.
+    """
+    variables = {"params": weights} if tape is None else {"params": weights, ACTIVATIONS: tape}
+    inputs = (class_table, carry, obs, prev_action_probs, is_first, dropout_mask)
+    out: Any = model.apply(variables, *inputs)
     return out
-
-
-def record(
-    model: ActorCritic,
-    weights: Any,
-    table: Any,
-    carry: Carry,
-    obs: Observation,
-    previous: jax.Array,
-    fresh: jax.Array,
-    keep: jax.Array | None = None,
-) -> tuple[Carry, Output, Any]:
-    """`forward` of one step, and the tape that it recorded."""
-    arguments = (table, carry, obs, previous, fresh, keep)
-    (after, out), variables = model.apply({"params": weights}, *arguments, mutable=[TAPE])
-    return after, out, variables.get(TAPE, {})

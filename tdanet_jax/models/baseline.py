@@ -8,44 +8,37 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.env.dynamics import Observation
+from tdanet_jax.env.types import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.classes import Classes
-from tdanet_jax.models.shared.image import ImageEncoder, ImageTable, ImageTrunk, image_alone
+from tdanet_jax.models.classes import ClassVocabulary
+from tdanet_jax.models.shared.image import ImageEncoder, ImageTable, only_image
 
 
 class BaselineEncoder(ImageEncoder):
-    """The image trunk and nothing else.
-
-    Attributes:
-      dropout: share of units that is dropped in training; published: 0.25.
-      dtype: operands of the large products.
-    """
-
-    dtype: Any = jnp.float32
-
-    def setup(self) -> None:
-        self.trunk = ImageTrunk(self.maps, self.dropout, self.dtype)
+    """The image trunk alone."""
 
     def prepare(self, words: jax.Array) -> ImageTable:
         """The trunk's table, from word vectors [C, D]."""
         return self.trunk.prepare(words)
 
     def __call__(
-        self, table: ImageTable, obs: Observation, action: jax.Array, keep: jax.Array | None = None
+        self,
+        class_table: ImageTable,
+        obs: Observation,
+        action: jax.Array,
+        dropout_mask: jax.Array | None = None,
     ) -> jax.Array:
         """The features of a batch of observations, [..., 3136]."""
-        return self.trunk(table, obs, action, keep)
+        return self.trunk(class_table, obs, action, dropout_mask)
 
     def view(self, obs: Observation) -> Observation:
         """The image and the target."""
-        return image_alone(obs, self.maps)
+        return only_image(obs, self.maps)
 
 
-def make(config: NetworkConfig, classes: Classes, dtype: Any) -> ActorCritic:
+def make(config: NetworkConfig, classes: ClassVocabulary, dtype: Any) -> ActorCritic:
     """The baseline."""
     encoder = BaselineEncoder(dropout=config.dropout, maps=config.image == "features", dtype=dtype)
     return ActorCritic(encoder, hidden=config.hidden, dtype=dtype)

@@ -2,8 +2,8 @@
 
 A model is one file, here or anywhere that Python finds it. It defines an `Encoder` and a function
 `make(config, classes, dtype) -> ActorCritic`. `--model` takes its dotted name; those in this folder
-have short ones, in `tdanet_jax.config.MODELS`. The environment, the update, the evaluation and
-every command then work with it.
+have short ones, in `tdanet_jax.models.registry.MODELS`. The environment, the update, the evaluation
+and every command then work with it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal
 import jax
 from flax import linen as nn
 
-from tdanet_jax.env.dynamics import Observation
+from tdanet_jax.env.types import Observation
 
 
 class Encoder(nn.Module, kw_only=True):
@@ -22,14 +22,14 @@ class Encoder(nn.Module, kw_only=True):
 
     Attributes:
       dropout: share of units that is dropped in training.
-      maps: its image is ResNet-18's feature map, `Observation.features`, and not the raster.
-      ROWS: the detections that it is made for: one row per "class", or None where the
-        configuration decides.
-      IMAGE: whether it looks at an image.
-      ACTION: how the previous step's action probabilities enter. "embedded": through a layer of
-        ten units, into the LSTM. "plain": as they are, into the LSTM. "inside": through the same
-        layer, into the encoder alone.
-      SHARED: names of its layers that no environment adapts for itself, where the network adapts
+      maps: its image is ResNet-18's feature map, `Observation.features`, instead of the raster.
+      ROWS: the detections that it is made for: one row per "class", or None if the configuration
+        decides.
+      IMAGE: whether it is shown an image.
+      ACTION: where the previous step's action probabilities enter. "embedded": into the LSTM,
+        through a layer of ten units. "plain": into the LSTM as they are. "inside": into the encoder
+        alone, through the same layer.
+      SHARED: names of its layers that are shared by all environments in networks that adapt
         (`tdanet_jax.models.shared.adaptation`).
     """
 
@@ -43,7 +43,7 @@ class Encoder(nn.Module, kw_only=True):
 
     @property
     def dropout_units(self) -> int:
-        """How many units of a frame dropout decides about."""
+        """How many units of a frame dropout acts on."""
         return 0
 
     def prepare(self, words: jax.Array) -> Any:
@@ -55,16 +55,21 @@ class Encoder(nn.Module, kw_only=True):
         raise NotImplementedError
 
     def __call__(
-        self, table: Any, obs: Observation, action: jax.Array, keep: jax.Array | None = None
+        self,
+        class_table: Any,
+        obs: Observation,
+        action: jax.Array,
+        dropout_mask: jax.Array | None = None,
     ) -> jax.Array:
         """The features of a batch of observations.
 
         Args:
-          table: from `prepare`, with the same parameters.
+          class_table: from `prepare`, with the same parameters.
           obs: observations with leading axes [...].
           action: [..., 10], the embedded action probabilities of the previous step; only where
             `ACTION` is "inside".
-          keep: [..., dropout_units] bool, which units dropout keeps; None when not training.
+          dropout_mask: [..., dropout_units] bool, the units that dropout keeps; None when not
+            training.
 
         Returns:
           [..., H] float32.
@@ -72,19 +77,19 @@ class Encoder(nn.Module, kw_only=True):
         raise NotImplementedError
 
     def view(self, obs: Observation) -> Observation:
-        """What of the observations the encoder uses, in shapes that are the same for all frames.
+        """The part of the observations that the encoder uses, in shapes equal for all frames.
 
-        It says the same of them as of the observations themselves. Only networks that remember
-        frames ask for it (`tdanet_jax.models.shared.adaptation`).
+        The encoder gives equal features for `view(obs)` and `obs`. Only networks that store frames
+        need it (`tdanet_jax.models.shared.adaptation`).
         """
         raise NotImplementedError
 
-    def attend(self, table: Any, obs: Observation) -> jax.Array | None:
+    def attend(self, class_table: Any, obs: Observation) -> jax.Array | None:
         """Attention over the detections, [..., K]; None if the model has none."""
         return None
 
-    def published_beside(self, width: int, inputs: int) -> Mapping[str, int]:
-        """Parameters that the published code has beside these, by name; negative where it has less.
+    def published_extra(self, width: int, inputs: int) -> Mapping[str, int]:
+        """Parameters that the published code has in addition, by name; negative where it has fewer.
 
         Args:
           width: of the word vectors.

@@ -1,16 +1,16 @@
-"""MJOLNIR's encoders (Qiu et al. 2020): graph convolution over the classes that are known.
+"""MJOLNIR's encoders (Qiu et al. 2020): graph convolutions over the known classes.
 
 Every known class is a node. A node's input is the presence of all classes in the frame, one entry
 per class, and its own word vector; three graph convolutions turn it into five numbers, the node's
-context (present, x, y, S, cosine to the target) joins them, a fourth makes one number of the ten,
+context (present, x, y, S, cosine to the target) is appended, a fourth makes one number of the ten,
 and a linear layer maps those of all nodes to the features. The adjacency starts as the class graph
 (`tdanet_jax.models.class_graph`) and is trained, as in the published code.
 
-MJOLNIR-o adds the context itself. MJOLNIR-r adds in its place the baseline's features of the image,
-in which the previous action probabilities enter; the context enters through the graph alone.
+MJOLNIR-o appends the context itself. MJOLNIR-r instead appends the baseline's features of the
+image, which the previous action probabilities enter; its context enters through the graph alone.
 
-The first three convolutions are those of `convolutions.py`: what the nodes share is the presence,
-the sum of the first kernel's rows of the classes in the frame.
+The first three convolutions are those of `shared.graph_convolutions`: what the nodes share is the
+presence, the sum of the first kernel's rows for the classes in the frame.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from flax import linen as nn
 from flax import struct
 
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.env.dynamics import FEATURES, Observation
+from tdanet_jax.env.types import FEATURES, Observation
 from tdanet_jax.models import class_graph
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.classes import Classes
+from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.layers import Linear, not_negative
+from tdanet_jax.models.layers import Linear, nonnegative_init
 from tdanet_jax.models.shared import graph_convolutions
 from tdanet_jax.models.shared.class_rows import (
     COLUMNS,
     RowTable,
     class_rows,
-    make_table,
-    published_beside,
-    rows_alone,
+    make_row_table,
+    only_rows,
+    published_extra,
 )
 from tdanet_jax.models.shared.graph_convolutions import Convolutions
-from tdanet_jax.models.shared.image import CHANNELS, ImageEncoder, ImageTable, ImageTrunk
+from tdanet_jax.models.shared.image import CHANNELS, ImageEncoder, ImageTable
 
-#: Units of a node behind the third convolution.
+#: Units of a node after the third convolution.
 NODE_UNITS = 5
 #: The names of the first three convolutions' kernels, which all environments share.
 KERNELS = ("kernels_0", "kernels_1", "kernels_2")
@@ -51,19 +51,13 @@ KERNELS = ("kernels_0", "kernels_1", "kernels_2")
 RESNET_CLASSES = 1000
 
 
-class Nodes(struct.PyTreeNode):
-    """What is known of n nodes with h = n + D units before any frame is seen."""
+class GraphTable(struct.PyTreeNode):
+    """What the graph computes from word vectors alone, for n nodes with h = n + D units."""
 
+    rows: RowTable
     words: jax.Array  # [n, h], word part of the first convolution, A E W0
     presence: jax.Array  # [n, h], rows of W0 for the presence of a class
     degree: jax.Array  # [n], row sums of A
-
-
-class GraphTable(struct.PyTreeNode):
-    """What the encoders take from word vectors alone."""
-
-    rows: RowTable
-    nodes: Nodes
 
 
 class Kernel(nn.Module):
@@ -76,7 +70,7 @@ class Kernel(nn.Module):
 
 
 class GraphEncoder(nn.Module):
-    """Presence and context of the known classes in, a vector of features out.
+    """From presence and context of the known classes to a vector of features.
 
     Attributes:
       classes: the vocabulary; its known classes are the nodes.
@@ -84,7 +78,7 @@ class GraphEncoder(nn.Module):
       dtype: operands of the large products.
     """
 
-    classes: Classes
+    classes: ClassVocabulary
     features: int = 512
     dtype: Any = jnp.float32
 
@@ -92,35 +86,34 @@ class GraphEncoder(nn.Module):
         start = functools.partial(class_graph.normalised, self.classes)
         self.adjacency = self.param("adjacency", lambda _: jnp.asarray(start()))
         self.kernels = [Kernel() for _ in range(3)]
-        self.last = self.param("last", not_negative, (NODE_UNITS + COLUMNS, 1))
+        self.last = self.param("last", nonnegative_init, (NODE_UNITS + COLUMNS, 1))
         self.mapping = Linear(self.features)
 
     def prepare(self, words: jax.Array) -> GraphTable:
-        """What depends on class names alone, from their word vectors [C, D]."""
+        """Everything that depends on class names alone, from their word vectors [C, D]."""
         known = np.array(self.classes.known, np.int32)
         width = len(known) + words.shape[1]
         kernel = self.kernels[0](width, width)
         presence, of_words = kernel[: len(known)], kernel[len(known) :]
-        nodes = Nodes(
+        return GraphTable(
+            rows=make_row_table(words, self.classes.known),
             words=self.adjacency @ (words[known] @ of_words),
             presence=presence,
             degree=self.adjacency.sum(axis=1),
         )
-        return GraphTable(make_table(words, self.classes.known), nodes)
 
-    def __call__(self, table: GraphTable, rows: jax.Array) -> jax.Array:
+    def __call__(self, class_table: GraphTable, rows: jax.Array) -> jax.Array:
         """The features [..., H] of the context [..., n, 5]."""
-        width = table.nodes.words.shape[1]
+        width = class_table.words.shape[1]
         weights = Convolutions(
-            words=table.nodes.words,
-            degree=table.nodes.degree,
+            words=class_table.words,
+            degree=class_table.degree,
             adjacency=self.adjacency,
             second=self.kernels[1](width, width),
             third=self.kernels[2](width, NODE_UNITS),
         )
-        nodes = graph_convolutions.apply(
-            self, weights, rows[..., 0] @ table.nodes.presence, self.dtype
-        )
+        present = rows[..., 0] @ class_table.presence
+        nodes = graph_convolutions.apply(self, weights, present, self.dtype)
         joined = jnp.concatenate([nodes, rows], axis=-1) @ self.last.astype(jnp.float32)
         return self.mapping(nn.relu(joined[..., 0] @ self.adjacency.astype(jnp.float32).T))
 
@@ -134,7 +127,7 @@ class MjolnirOEncoder(Encoder):
       dtype: operands of the large products.
     """
 
-    classes: Classes
+    classes: ClassVocabulary
     features: int = 512
     dtype: Any = jnp.float32
 
@@ -149,20 +142,24 @@ class MjolnirOEncoder(Encoder):
         return self.graph.prepare(words)
 
     def __call__(
-        self, table: GraphTable, obs: Observation, action: jax.Array, keep: jax.Array | None = None
+        self,
+        class_table: GraphTable,
+        obs: Observation,
+        action: jax.Array,
+        dropout_mask: jax.Array | None = None,
     ) -> jax.Array:
         """The features of a batch of observations, [..., H + 5 n]."""
-        rows = class_rows(table.rows, obs)
+        rows = class_rows(class_table.rows, obs)
         context = rows.reshape(*obs.empty.shape, -1)
-        return jnp.concatenate([self.graph(table, rows), context], axis=-1)
+        return jnp.concatenate([self.graph(class_table, rows), context], axis=-1)
 
-    def published_beside(self, width: int, inputs: int) -> dict[str, int]:
-        """Frozen word vectors and a layer without use; the adjacency is trained, as published."""
-        return published_beside(len(self.classes.known), width, inputs)
+    def published_extra(self, width: int, inputs: int) -> dict[str, int]:
+        """Frozen word vectors and an unused layer; the adjacency is trained, as published."""
+        return published_extra(len(self.classes.known), width, inputs)
 
     def view(self, obs: Observation) -> Observation:
         """The known classes and the target."""
-        return rows_alone(obs, self.classes.known)
+        return only_rows(obs, self.classes.known)
 
 
 class MjolnirREncoder(ImageEncoder):
@@ -171,18 +168,15 @@ class MjolnirREncoder(ImageEncoder):
     Attributes:
       classes: the vocabulary.
       features: units of the graph's features.
-      dropout: share of units that is dropped in training, in the image trunk; published: 0.25.
-      dtype: operands of the large products.
     """
 
-    classes: Classes
+    classes: ClassVocabulary
     features: int = 512
-    dtype: Any = jnp.float32
 
     ROWS = "class"
 
     def setup(self) -> None:
-        self.trunk = ImageTrunk(self.maps, self.dropout, self.dtype)
+        super().setup()
         self.graph = GraphEncoder(self.classes, self.features, self.dtype)
 
     def prepare(self, words: jax.Array) -> tuple[ImageTable, GraphTable]:
@@ -191,27 +185,30 @@ class MjolnirREncoder(ImageEncoder):
 
     def __call__(
         self,
-        table: tuple[ImageTable, GraphTable],
+        class_table: tuple[ImageTable, GraphTable],
         obs: Observation,
         action: jax.Array,
-        keep: jax.Array | None = None,
+        dropout_mask: jax.Array | None = None,
     ) -> jax.Array:
         """The features of a batch of observations, [..., 3136 + H]."""
-        image = self.trunk(table[0], obs, action, keep)
-        graph_features = self.graph(table[1], class_rows(table[1].rows, obs))
-        return jnp.concatenate([image, graph_features], axis=-1)
+        image_table, graph_table = class_table
+        image = self.trunk(image_table, obs, action, dropout_mask)
+        graph = self.graph(graph_table, class_rows(graph_table.rows, obs))
+        return jnp.concatenate([image, graph], axis=-1)
 
-    def published_beside(self, width: int, inputs: int) -> dict[str, int]:
-        """What stands beside MJOLNIR-o, a layer of ResNet-18, and the channels of zeros."""
+    def published_extra(self, width: int, inputs: int) -> dict[str, int]:
+        """As MJOLNIR-o, and a layer of ResNet-18 and the channels of zeros."""
         channels = FEATURES[-1]
         return {
-            **published_beside(len(self.classes.known), width, inputs),
+            **published_extra(len(self.classes.known), width, inputs),
             "ResNet-18's scores, unused": (channels + 1) * RESNET_CLASSES,
             "the convolution's zero channels": 0 if self.maps else (channels - width) * CHANNELS,
         }
 
 
-def make(config: NetworkConfig, classes: Classes, dtype: Any, image: bool = False) -> ActorCritic:
+def make(
+    config: NetworkConfig, classes: ClassVocabulary, dtype: Any, image: bool = False
+) -> ActorCritic:
     """MJOLNIR with a node per class that training may know: MJOLNIR-r with `image`, else -o."""
     if image:
         encoder: Encoder = MjolnirREncoder(

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from tdanet_jax.config import NetworkConfig, TrainConfig
     from tdanet_jax.models.actor_critic import ActorCritic
-    from tdanet_jax.models.classes import Classes
+    from tdanet_jax.models.classes import ClassVocabulary
 
 #: Models by name: the module that makes each, and the settings that it is made with.
 MODELS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
@@ -33,7 +33,7 @@ MODELS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
 }
 
 
-def make_model(config: TrainConfig, classes: Classes) -> ActorCritic:
+def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
     """The network of a configuration; its `spec` says what it is shown.
 
     Args:
@@ -84,7 +84,7 @@ def resolve_precision(config: NetworkConfig) -> NetworkConfig:
     return dataclasses.replace(config, precision="bfloat16" if fast else "float32")
 
 
-def unused_flags(config: TrainConfig, classes: Classes) -> list[str]:
+def unused_flags(config: TrainConfig, classes: ClassVocabulary) -> list[str]:
     """The network's flags that are set but change nothing for this model, if it is not custom."""
     network, default = config.network, type(config.network)()
     if config.model not in MODELS:
@@ -103,7 +103,8 @@ def unused_flags(config: TrainConfig, classes: Classes) -> list[str]:
         changed = dataclasses.replace(network, **values)
         return model == make_model(dataclasses.replace(config, network=changed), classes)
 
-    names = [field.name for field in dataclasses.fields(network) if field.name != "word_norm"]
+    always_used = ("word_norm", "odometry", "triangulation", "sensors")
+    names = (field.name for field in dataclasses.fields(network) if field.name not in always_used)
     chosen = [name for name in names if getattr(network, name) != getattr(default, name)]
     flags = [f"--{name.replace('_', '-')}" for name in chosen if is_unused(name)]
     return [*flags, "--size-noise"] if config.learner.size_noise and model.encoder.IMAGE else flags

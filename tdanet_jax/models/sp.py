@@ -1,9 +1,9 @@
 """Scene priors: the baseline with a graph convolution over classes (Yang et al. 2019).
 
-As in the published code: a node of the class graph is [what the frame shows, the class's word
-vector], the former the same for all nodes; three graph convolutions give one number per node, and a
-linear map of these joins the image's features. What the frame shows are a frozen ResNet's scores of
-1,000 classes; here, which of the known classes the raster holds.
+As in the published code, a node of the class graph has two inputs: what the frame shows, the same
+for all nodes, and its class's word vector. Three graph convolutions give one number per node, and a
+linear layer of these joins the image's features. What the frame shows are a frozen ResNet's scores
+of 1,000 classes there, and here which of the known classes the raster holds.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from flax import linen as nn
 from flax import struct
 
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.env.dynamics import Observation
+from tdanet_jax.env.types import Observation
 from tdanet_jax.models import class_graph
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.classes import Classes
-from tdanet_jax.models.layers import Linear, not_negative
+from tdanet_jax.models.classes import ClassVocabulary
+from tdanet_jax.models.layers import Linear, nonnegative_init
 from tdanet_jax.models.shared import graph_convolutions
 from tdanet_jax.models.shared.graph_convolutions import Convolutions
-from tdanet_jax.models.shared.image import ImageEncoder, ImageTable, ImageTrunk
+from tdanet_jax.models.shared.image import ImageEncoder, ImageTable
 
 
-class SceneTable(struct.PyTreeNode):
-    """What is known before any frame is seen."""
+class ScenePriorsTable(struct.PyTreeNode):
+    """What the encoder computes from word vectors alone."""
 
     image: ImageTable
-    nodes: jax.Array  # [n, width], the words' part of the first graph convolution
-    node: jax.Array  # [C + 1] int32, node of a class; n where it has none
+    nodes: jax.Array  # [n, width], the word vectors' part of the first graph convolution
+    node: jax.Array  # [C + 1] int32, node of a class; n if it has none
 
 
 class ScenePriorsEncoder(ImageEncoder):
@@ -43,46 +43,48 @@ class ScenePriorsEncoder(ImageEncoder):
       adjacency: [n, n] as nested tuples, normalised.
       features: units of either part of a node's input, and of the graph's output.
       width: units of a node's hidden layers.
-      dropout: share of units that is dropped in training, in the image trunk.
-      dtype: operands of the large products.
     """
 
     known: tuple[int, ...]
     adjacency: tuple[tuple[float, ...], ...]
     features: int = 512
     width: int = 1024
-    dtype: Any = jnp.float32
 
     def setup(self) -> None:
+        super().setup()
         init = nn.initializers.he_uniform()
-        self.trunk = ImageTrunk(self.maps, self.dropout, self.dtype)
         self.seen = Linear(self.features)
         self.words = Linear(self.features)
         self.convolution_seen = Linear(self.width, kernel_init=init, use_bias=False)
         self.convolution_words = Linear(self.width, kernel_init=init, use_bias=False)
         self.kernel1 = self.param("kernel1", init, (self.width, self.width))
-        self.kernel2 = self.param("kernel2", not_negative, (self.width, 1))
+        self.kernel2 = self.param("kernel2", nonnegative_init, (self.width, 1))
         self.mapping = Linear(self.features)
 
-    def prepare(self, words: jax.Array) -> SceneTable:
+    def prepare(self, words: jax.Array) -> ScenePriorsTable:
         """The trunk's table and the nodes' words, from word vectors [C, D]."""
         known = np.array(self.known)
         nodes = self.convolution_words(jnp.asarray(self.adjacency) @ self.words(words[known]))
         node = jnp.full(len(words) + 1, len(known)).at[known].set(jnp.arange(len(known)))
-        return SceneTable(self.trunk.prepare(words), nodes, node)
+        return ScenePriorsTable(self.trunk.prepare(words), nodes, node)
 
     def __call__(
-        self, table: SceneTable, obs: Observation, action: jax.Array, keep: jax.Array | None = None
+        self,
+        class_table: ScenePriorsTable,
+        obs: Observation,
+        action: jax.Array,
+        dropout_mask: jax.Array | None = None,
     ) -> jax.Array:
         """The features of a batch of observations, [..., 3136 + features]."""
         assert obs.cells is not None
-        image = self.trunk(table.image, obs, action, keep)
-        cells = table.node[obs.cells].reshape(*obs.cells.shape[:-2], -1)  # -1: no class, no node
-        seen = (cells[..., None] == jnp.arange(len(self.known))).any(axis=-2)
+        image = self.trunk(class_table.image, obs, action, dropout_mask)
+        nodes = class_table.node[obs.cells]  # a cell without a class, -1, has no node
+        nodes = nodes.reshape(*obs.cells.shape[:-2], -1)
+        seen = (nodes[..., None] == jnp.arange(len(self.known))).any(axis=-2)
         frame = self.convolution_seen(self.seen(seen.astype(jnp.float32)))  # [..., width]
         adjacency = jnp.asarray(self.adjacency)
         weights = Convolutions(
-            words=table.nodes,
+            words=class_table.nodes,
             degree=adjacency.sum(axis=1),
             adjacency=adjacency,
             second=self.kernel1,
@@ -92,7 +94,9 @@ class ScenePriorsEncoder(ImageEncoder):
         return jnp.concatenate([image, self.mapping(scores)], axis=-1)
 
 
-def make(config: NetworkConfig, classes: Classes, dtype: Any, width: int = 1024) -> ActorCritic:
+def make(
+    config: NetworkConfig, classes: ClassVocabulary, dtype: Any, width: int = 1024
+) -> ActorCritic:
     """Scene priors, with `width` units in a node's hidden layers."""
     encoder = ScenePriorsEncoder(
         known=classes.known,

@@ -1,10 +1,10 @@
 """SSNet's encoder (Zhao et al. 2023): self-attention over a row per known class.
 
 A frame is a row per class that training may know: (present, x, y, S, cosine of the word vectors of
-class and target). A single head of self-attention maps the rows to as many rows of five; flattened,
-they go into the LSTM beside the previous action probabilities, which enter as they are. Classes
-are told apart by the place of their row and by their cosine, so what the network learns of a target
-it learns through the cosines alone: that is how it finds unseen targets.
+class and target). A single head of self-attention (Eq. 3) maps the rows to as many rows of five;
+flattened, they are the LSTM's input, together with the previous action probabilities as they are.
+Classes are told apart by the index of their row and by their cosine alone, so what the network
+learns of a target it learns through the cosines: that is how it finds unseen targets.
 """
 
 from __future__ import annotations
@@ -16,30 +16,30 @@ import jax.numpy as jnp
 import numpy as np
 
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.env.dynamics import Observation
+from tdanet_jax.env.types import Observation
+from tdanet_jax.models.activation_cache import cached
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.classes import Classes
+from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.layers import recorded
 from tdanet_jax.models.shared.class_rows import (
     COLUMNS,
     RowTable,
     class_rows,
-    make_table,
-    published_beside,
+    make_row_table,
+    published_extra,
 )
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
-#: W_Q and W_K start as this times the unit matrix, W_V as the other, each with a little noise. From
-#: torch's small random start a row's attention is even over a hundred rows, all outputs are alike,
-#: and a million steps teach nothing; from a sharp start rows attend rows that are like them.
+#: W_Q and W_K start as the identity times SHARP, W_V as the identity times LARGE, each with noise.
+#: From torch's small random start a row's attention is even over a hundred rows, all outputs are
+#: alike, and a million steps teach nothing; from a sharp start, rows attend to similar rows.
 SHARP, LARGE, NOISE = 6.0, 4.0, 0.1
 #: Columns i <= j of the products of two columns of a row.
 PAIRS = np.triu_indices(COLUMNS)
 
 
 class SSNetEncoder(Encoder):
-    """Detections per class and a target class in, 5 n features out.
+    """From detections per class and a target class to 5 n features.
 
     Attributes:
       known: the n classes that have a row.
@@ -52,41 +52,45 @@ class SSNetEncoder(Encoder):
 
     def setup(self) -> None:
         def matrix(name: str, scale: float) -> jax.Array:
-            return self.param(name, lambda key: near_unit(key, scale))
+            return self.param(name, lambda key: near_identity(key, scale))
 
         self.query, self.key = matrix("query", SHARP), matrix("key", SHARP)
         self.value = matrix("value", LARGE)
 
     def prepare(self, words: jax.Array) -> RowTable:
         """Rows and cosines, from word vectors [C, D]."""
-        return make_table(words, self.known)
+        return make_row_table(words, self.known)
 
     def __call__(
-        self, table: RowTable, obs: Observation, action: jax.Array, keep: jax.Array | None = None
+        self,
+        class_table: RowTable,
+        obs: Observation,
+        action: jax.Array,
+        dropout_mask: jax.Array | None = None,
     ) -> jax.Array:
         """The features of a batch of observations, [..., 5 n]."""
-        rows = class_rows(table, obs)
+        rows = class_rows(class_table, obs)
         mixing = self.query @ self.key.T
-        found = recorded(self, "moments", lambda: moments(jax.lax.stop_gradient(mixing), rows))
+        found = cached(self, "moments", lambda: moments(jax.lax.stop_gradient(mixing), rows))
         out = attend(mixing, rows, found) @ self.value
         return out.reshape(*obs.empty.shape, -1)
 
-    def published_beside(self, width: int, inputs: int) -> dict[str, int]:
-        """Frozen word vectors, and two layers without use."""
+    def published_extra(self, width: int, inputs: int) -> dict[str, int]:
+        """Frozen word vectors, and two unused layers."""
         embedding = (NUM_ACTIONS + 1) * 10
         return {
-            **published_beside(len(self.known), width, inputs),
+            **published_extra(len(self.known), width, inputs),
             "an embedding of actions, unused": embedding,
         }
 
 
-def near_unit(key: jax.Array, scale: float) -> jax.Array:
-    """The unit matrix [5, 5], scaled, with noise."""
+def near_identity(key: jax.Array, scale: float) -> jax.Array:
+    """The identity matrix [5, 5], scaled, with noise."""
     return scale * jnp.eye(COLUMNS) + NOISE * jax.random.normal(key, (COLUMNS, COLUMNS))
 
 
 def moments(mixing: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What each row's attention finds: mean and covariance of the rows under its weights.
+    """Mean and covariance of the rows under each row's attention weights.
 
     The weights of row i are softmax_j(r_i W_Q W_K^T r_j), without scaling.
 
@@ -109,10 +113,10 @@ def moments(mixing: jax.Array, rows: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 @jax.custom_vjp
 def attend(mixing: jax.Array, rows: jax.Array, found: tuple[jax.Array, jax.Array]) -> jax.Array:
-    """The mean of the rows under each row's attention, [..., n, 5], of what `moments` has found.
+    """The mean of the rows under each row's attention, [..., n, 5], given `found` from `moments`.
 
-    A softmax's derivative is a covariance: the mean of row i changes by its covariance times the
-    change of r_i W_Q W_K^T. So the backward pass touches no weight of a pair of rows again.
+    The derivative of a softmax is a covariance: the mean of row i changes by its covariance times
+    the change of r_i W_Q W_K^T. So the backward pass needs no weights of pairs of rows.
     """
     return found[0]
 
@@ -136,6 +140,6 @@ def _attend_bwd(
 attend.defvjp(_attend_fwd, _attend_bwd)
 
 
-def make(config: NetworkConfig, classes: Classes, dtype: Any) -> ActorCritic:
+def make(config: NetworkConfig, classes: ClassVocabulary, dtype: Any) -> ActorCritic:
     """SSNet with a row per class that training may know."""
     return ActorCritic(SSNetEncoder(known=classes.known), hidden=config.hidden, dtype=dtype)

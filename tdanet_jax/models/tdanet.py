@@ -5,10 +5,10 @@ logits are inner products, the weights their masked softmax, and V_L1 = V_att M_
 architecture (SA, Eq. 2): the same layers on the attended detection and on the target, and the
 absolute difference of the two.
 
-Three equal, cheaper forms are used; a test holds them equal to the printed ones. All class names
-are known while training, so the products of word vectors are taken once per update for the table
-of classes (`prepare`) and looked up per detection. Linear1 is linear where V_L1 = V_att M_L1, so
-detections are pooled before they are projected. The target's branch is the same for every frame.
+Three equal but cheaper forms are used; a test compares them with the printed ones. All class names
+are known in training, so the products of word vectors are computed once per update for all classes
+(`prepare`) and looked up per detection. No ReLU comes between Linear1 and V_L1 = V_att M_L1, so
+detections are pooled before they are projected. The target's branch is equal for all frames.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from flax import linen as nn
 from flax import struct
 
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.env.dynamics import Observation
+from tdanet_jax.env.types import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.classes import Classes
+from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import Linear, look_up, look_up_in_rows
 
-#: Centre and area that stand before the target's word vector in its row.
+#: Centre and area in the target's row, before its word vector.
 TARGET_BOX = (0.5, 0.5, 0.25)
 
 
 class ClassTable(struct.PyTreeNode):
-    """What is known of a class before any frame is seen. First axis C_t: the class as target."""
+    """The products with word vectors, by class. First axis C_t: the class as target."""
 
     words: jax.Array  # [C, D], word vector of each class
     class_logits: jax.Array  # [C_t, C], attention logit of a class's word vector
@@ -42,14 +42,14 @@ class ClassTable(struct.PyTreeNode):
 
 
 class TDANetEncoder(Encoder):
-    """Detections and a target class in, H features out.
+    """From detections and a target class to H features.
 
     Attributes:
       width: H, units of every layer.
       dropout: share of the absolute difference that is dropped in training; the paper's is 0.25.
       target_attention: False replaces TA by the mean of the detections (the paper's Table IV).
       siamese: False replaces SA by the attended feature alone (Table IV). With neither, nothing
-        would be left of the target, so its word vector is appended to the features.
+        would depend on the target, so its word vector is appended to the features.
       dtype: operands of the products; parameters and sums stay float32.
     """
 
@@ -80,9 +80,9 @@ class TDANetEncoder(Encoder):
         class_logits, box_logits = jnp.zeros((count, count)), jnp.zeros((count, 3))
         if self.target_attention:
             queries = self.attention(targets)  # [C, H]
-            # W_L of a row is the sum over its parts, so the logits are, too.
-            nothing = self.attention(jnp.zeros((1, words.shape[1] + 3)))  # the bias
-            units = self.attention(jnp.eye(3, words.shape[1] + 3)) - nothing  # [3, H]
+            # W_L of a row is the sum over its parts, and so are the logits.
+            bias = self.attention(jnp.zeros((1, words.shape[1] + 3)))
+            units = self.attention(jnp.eye(3, words.shape[1] + 3)) - bias  # [3, H]
             names = self.attention(jnp.pad(words, ((0, 0), (3, 0))))  # [C, H], bias included
             class_logits, box_logits = queries @ names.T, queries @ units.T
         return ClassTable(words, class_logits, box_logits, self.branch(targets))
@@ -91,49 +91,49 @@ class TDANetEncoder(Encoder):
         """Linear1 and Linear2, shared by the attended detection and the target."""
         return nn.relu(self.linear2(nn.relu(self.linear1(rows))))
 
-    def attend(self, table: ClassTable, obs: Observation) -> jax.Array:
-        """Attention over the detections: [..., K], 0 in padding, summing to 1 in any frame.
+    def attend(self, class_table: ClassTable, obs: Observation) -> jax.Array:
+        """Attention over the detections (Eq. 1): [..., K], 0 in padding, summing to 1.
 
-        In a frame without detections the first row, all zero, gets all of it.
+        In a frame without detections the first row, all zero, has weight 1.
         """
         first = jnp.arange(obs.mask.shape[-1]) == 0
         mask = obs.mask | (obs.empty[..., None] & first)
         if not self.target_attention:
             return mask / mask.sum(-1, keepdims=True)
-        logits = look_up_in_rows(table.class_logits, obs.target, obs.classes)
-        units = look_up(table.box_logits, obs.target)
+        logits = look_up_in_rows(class_table.class_logits, obs.target, obs.classes)
+        units = look_up(class_table.box_logits, obs.target)
         logits += jnp.einsum("...i,...ki->...k", units, obs.boxes)
         self.sow("intermediates", "correspondence", logits)
         return nn.softmax(logits, axis=-1, where=mask)
 
     def __call__(
         self,
-        table: ClassTable,
+        class_table: ClassTable,
         obs: Observation,
         action: jax.Array,
-        keep: jax.Array | None = None,
+        dropout_mask: jax.Array | None = None,
     ) -> jax.Array:
         """The features of a batch of observations, [..., H]."""
-        weights = self.attend(table, obs)
+        weights = self.attend(class_table, obs)
         chex.assert_equal_shape([weights, obs.mask, obs.classes])
-        # The all-zero row of an empty frame has no word vector either.
-        worded = jnp.where(obs.mask, weights, 0.0)
+        # The all-zero row of an empty frame has no word vector.
+        word_weights = jnp.where(obs.mask, weights, 0.0)
         boxes = jnp.einsum("...k,...ki->...i", weights, obs.boxes)
-        names = pool(worded, obs.classes, table.words)
+        names = pool(word_weights, obs.classes, class_table.words)
         features = self.branch(jnp.concatenate([boxes, names], axis=-1))
         if self.siamese:
-            features = jnp.abs(features - look_up(table.reference, obs.target))
+            features = jnp.abs(features - look_up(class_table.reference, obs.target))
             self.sow("intermediates", "difference", features)
-        if keep is not None and self.dropout > 0:
-            features = jnp.where(keep, features / (1 - self.dropout), 0.0)
+        if dropout_mask is not None and self.dropout > 0:
+            features = jnp.where(dropout_mask, features / (1 - self.dropout), 0.0)
         if not self.siamese and not self.target_attention:
-            features = jnp.concatenate([features, table.words[obs.target]], axis=-1)
+            features = jnp.concatenate([features, class_table.words[obs.target]], axis=-1)
         return nn.relu(self.linear4(nn.relu(self.linear3(features))))
 
 
 def make(
     config: NetworkConfig,
-    classes: Classes,
+    classes: ClassVocabulary,
     dtype: Any,
     target_attention: bool = True,
     siamese: bool = True,
@@ -156,7 +156,7 @@ def pool(weights: jax.Array, classes: jax.Array, words: jax.Array) -> jax.Array:
     Args:
       weights: [..., K].
       classes: [..., K] int32.
-      words: [C, D]; constant, they get no gradient.
+      words: [C, D], constants without a gradient.
 
     Returns:
       [..., D].

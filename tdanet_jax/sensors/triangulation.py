@@ -1,44 +1,47 @@
-"""Where the target is, from the directions in which it was seen and from the agent's own way.
+"""Triangulation: the target's position from the bearings of its past detections.
 
-A box says in which direction an object lies, and not how far away: it may be near, or large.
-Directions from two places cross where it is. So an agent that knows its way (`odometry.py`) can
-tell the distance of what it was never trained to find, whatever its size. The target's place is the
-point with the least sum of squared distances from all rays along which it was seen, and from a weak
-guess: 1.5 m away on the first of them. The environment and an agent on its own run the same
-functions.
+A box tells in which direction an object lies, and not how far away: it may be near, or large.
+Bearings from two places intersect where it is. So an agent with odometry can tell the distance of
+a class that it was never trained to find, whatever its size. The estimate is the point with the
+least sum of squared distances to all rays along which the target was seen, and to a weak prior:
+1.5 m away along the first of them.
 
-Axes are those of `odometry.Trail`, x and z along the grid and y up, in metres from the camera,
-whose view is 90 degrees wide and high.
+Axes are those of `odometry.OdometryState`, x and z along the grid and y up, in metres from the
+camera, whose field of view is 90 degrees in both directions.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from tdanet_jax.scenes.scene import GRID, REACH
+from tdanet_jax.poses import GRID_SIZE
+from tdanet_jax.sensors import odometry
+from tdanet_jax.sensors.sensor import Frame, Motion, Sensor, Start
+from tdanet_jax.vocabulary import VISIBILITY_DISTANCE
 
-#: Length of `sense`.
-NUMBERS = 9
-#: Weight of the guess, where a ray weighs 1.
-GUESS = 1e-3
-#: A box is of the object that was seen before if it is less than 12 degrees away from the place
-#: that follows if it is.
-SAME = float(np.cos(np.radians(12)))
-#: Weight along the line of sight at which the place is half certain.
-HALF = 0.03
-#: Most of a radius, in metres.
-WIDEST = 1.0
-#: Metres of the place are divided by this, and clipped at twice as many.
-FAR = 4.0
-#: Metres to the border of reach are divided by this, and clipped there.
+#: Weight of the prior, where a ray has weight 1.
+PRIOR_WEIGHT = 1e-3
+#: A box belongs to the tracked object if the position re-estimated with it lies within 12 degrees
+#: of the box's direction.
+SAME_OBJECT_COSINE = float(np.cos(np.radians(12)))
+#: Weight along the line of sight at which the certainty is one half.
+HALF_CERTAIN = 0.03
+#: Upper bound of a radius, in metres.
+MAX_RADIUS = 1.0
+#: Positions are divided by this many metres, and clipped at twice as many.
+POSITION_SCALE = 4.0
+#: Distances to the border of reach are divided by this many metres, and clipped there.
 BORDER = 0.25
 
 
-class Sighting(struct.PyTreeNode):
-    """What is known of the target's place p: the normal equations normal p = moment."""
+class TargetEstimate(struct.PyTreeNode):
+    """What is known of the target's position p: the normal equations `normal p = moment`."""
 
     normal: jax.Array  # [3, 3] float32, sum of the projections across the rays; 0 without any
     moment: jax.Array  # [3] float32
@@ -46,100 +49,114 @@ class Sighting(struct.PyTreeNode):
     moved: jax.Array  # bool, the agent has moved since the last ray
 
 
-def begin() -> Sighting:
-    """Nothing was seen yet."""
-    return Sighting(jnp.zeros((3, 3)), jnp.zeros(3), jnp.zeros(()), jnp.zeros((), bool))
+def no_estimate() -> TargetEstimate:
+    """The target has not been seen yet."""
+    return TargetEstimate(jnp.zeros((3, 3)), jnp.zeros(3), jnp.zeros(()), jnp.zeros((), bool))
 
 
-def forget(sighting: Sighting, lost: jax.Array) -> Sighting:
-    """Nothing, if it is `lost`, a bool."""
-    return _choose(lost, begin(), sighting)
+class Triangulation(Sensor):
+    """Tracks the target's position over an episode."""
+
+    REQUIRES = ("odometry",)
+    width = 9
+
+    def init(self, start: Start) -> TargetEstimate:
+        """No estimate."""
+        return no_estimate()
+
+    def update(
+        self, state: TargetEstimate, motion: Motion, others: Mapping[str, Any]
+    ) -> TargetEstimate:
+        """Shifts the origin to where the agent stands now."""
+        cells = odometry.last_step(others["odometry"])
+        x, z = cells * GRID_SIZE
+        moved = jnp.stack([x, jnp.zeros_like(x), z])
+        return state.replace(
+            moment=state.moment - _dot(state.normal, moved),
+            moved=state.moved | jnp.any(cells != 0),
+        )
+
+    def observe(
+        self, state: TargetEstimate, frame: Frame, others: Mapping[str, Any]
+    ) -> TargetEstimate:
+        """Adds the ray of the target's box, if it is in view.
+
+        Of several boxes it takes the one nearest to the estimated direction. If that cannot be the
+        object tracked so far, it starts anew with the largest. Only the first ray from one point
+        counts.
+        """
+        heading, horizon = others["odometry"].heading, others["odometry"].horizon
+        boxes, is_target = frame.boxes, frame.mask & (frame.classes == frame.target)
+        rays = _rays(boxes, heading, horizon)  # as long as what they show is one metre deep
+        lengths = jnp.linalg.norm(rays, axis=-1)
+        directions = rays / lengths[:, None]
+        cosine = _dot(directions, _direction(_solve(state)[0]))
+        nearest = jnp.argmax(jnp.where(is_target, cosine, -2.0))
+        largest = jnp.argmax(jnp.where(is_target, boxes[:, 2], -1.0))
+        more = _add(state, directions[nearest], state.moved)
+        agrees = _dot(directions[nearest], _direction(_solve(more)[0])) > SAME_OBJECT_COSINE
+        same = _any_ray(state) & agrees
+        prior = no_estimate().replace(
+            normal=PRIOR_WEIGHT * jnp.eye(3),
+            moment=PRIOR_WEIGHT * VISIBILITY_DISTANCE * directions[largest],
+        )
+        seen = _choose(same, more, _add(prior, directions[largest], True))
+        chosen = jnp.where(same, nearest, largest)
+        # At a depth of one metre, the image is two metres wide.
+        depth = jnp.linalg.norm(_solve(seen)[0]) / lengths[chosen]
+        radius = jnp.minimum(jnp.sqrt(boxes[chosen, 2]) * depth, MAX_RADIUS)
+        return _choose(jnp.any(is_target), seen.replace(radius=radius), state)
+
+    def clear(self, state: TargetEstimate, changed: jax.Array) -> TargetEstimate:
+        """No estimate of another target."""
+        return _choose(changed, no_estimate(), state)
+
+    def read(self, state: TargetEstimate, others: Mapping[str, Any]) -> jax.Array:
+        """[9] float32, zeros until the target has been seen.
+
+        Its position to the right of, above and ahead of the agent as it faces now, in units of 4 m;
+        its radius; the certainty of the position along the line of sight, from 0 to 1; how far its
+        centre and its near side are within 1.5 m horizontally, in units of 0.25 m, from -1 to 1;
+        and these two times the certainty.
+        """
+        position, weight = _solve(state)
+        angle = others["odometry"].heading * (jnp.pi / 4)
+        sine, cosine = jnp.sin(angle), jnp.cos(angle)
+        x, y, z = position
+        turned = jnp.stack([x * cosine - z * sine, y, x * sine + z * cosine])
+        left = VISIBILITY_DISTANCE - jnp.hypot(x, z)
+        within = jnp.clip(jnp.stack([left, left + state.radius]) / BORDER, -1.0, 1.0)
+        certainty = weight / (weight + HALF_CERTAIN)
+        reading = jnp.concatenate(
+            [
+                jnp.clip(turned / POSITION_SCALE, -2.0, 2.0),
+                jnp.stack([state.radius, certainty]),
+                within,
+                within * certainty,
+            ]
+        )
+        return jnp.where(_any_ray(state), reading, 0.0)
 
 
-def follow(sighting: Sighting, cells: jax.Array) -> Sighting:
-    """The same, once the agent has gone `cells` [2] int32, along x and z."""
-    x, z = cells * GRID
-    moved = jnp.stack([x, jnp.zeros_like(x), z])
-    return sighting.replace(
-        moment=sighting.moment - _dot(sighting.normal, moved),
-        moved=sighting.moved | jnp.any(cells != 0),
-    )
+def make() -> Triangulation:
+    """The sensor."""
+    return Triangulation()
 
 
-def look(
-    sighting: Sighting,
-    heading: jax.Array,
-    horizon: jax.Array,
-    boxes: jax.Array,
-    is_target: jax.Array,
-) -> Sighting:
-    """The same, once the agent has seen what is in view.
-
-    Of several targets it goes on with the one nearest to the place known before. If that cannot be
-    the one seen before, it begins anew with the largest. From one point, only the first ray counts.
-
-    Args:
-      heading: int32, in steps of 45 degrees clockwise from z.
-      horizon: int32, 1 while looking 30 degrees down.
-      boxes: [K, 3] x, y, S of the detections.
-      is_target: [K] bool, False in padding.
-    """
-    rays = _rays(boxes, heading, horizon)  # as long as what they show is one metre deep
-    lengths = jnp.linalg.norm(rays, axis=-1)
-    directions = rays / lengths[:, None]
-    likeness = _dot(directions, _direction(_solve(sighting)[0]))
-    nearest = jnp.argmax(jnp.where(is_target, likeness, -2.0))
-    largest = jnp.argmax(jnp.where(is_target, boxes[:, 2], -1.0))
-    more = _add(sighting, directions[nearest], sighting.moved)
-    likely = _dot(directions[nearest], _direction(_solve(more)[0])) > SAME
-    same = _any_ray(sighting) & likely
-    guess = begin().replace(normal=GUESS * jnp.eye(3), moment=GUESS * REACH * directions[largest])
-    seen = _choose(same, more, _add(guess, directions[largest], True))
-    chosen = jnp.where(same, nearest, largest)
-    # What is one metre deep is two metres of an image's side.
-    depth = jnp.linalg.norm(_solve(seen)[0]) / lengths[chosen]
-    radius = jnp.minimum(jnp.sqrt(boxes[chosen, 2]) * depth, WIDEST)
-    return _choose(jnp.any(is_target), seen.replace(radius=radius), sighting)
+def _any_ray(estimate: TargetEstimate) -> jax.Array:
+    return estimate.normal[0, 0] > 0
 
 
-def sense(sighting: Sighting, heading: jax.Array) -> jax.Array:
-    """What the agent senses of its target: [9] float32, zeros before it was seen.
-
-    Its place, to the right, up and ahead of the agent as it faces now, in units of 4 m; its radius;
-    how certain the place is, from 0 to 1, along the line to it; how far its middle and its side are
-    within 1.5 m on the level, in units of 0.25 m, from -1 to 1; and these two times the certainty.
-    """
-    place, weight = _solve(sighting)
-    angle = heading * (jnp.pi / 4)
-    sine, cosine = jnp.sin(angle), jnp.cos(angle)
-    x, y, z = place
-    turned = jnp.stack([x * cosine - z * sine, y, x * sine + z * cosine])
-    left = REACH - jnp.hypot(x, z)
-    within = jnp.clip(jnp.stack([left, left + sighting.radius]) / BORDER, -1.0, 1.0)
-    certain = weight / (weight + HALF)
-    sensed = jnp.concatenate(
-        [
-            jnp.clip(turned / FAR, -2.0, 2.0),
-            jnp.stack([sighting.radius, certain]),
-            within,
-            within * certain,
-        ]
-    )
-    return jnp.where(_any_ray(sighting), sensed, 0.0)
-
-
-def _any_ray(sighting: Sighting) -> jax.Array:
-    return sighting.normal[0, 0] > 0
-
-
-def _add(sighting: Sighting, direction: jax.Array, counts: jax.Array | bool) -> Sighting:
-    """The same with one more ray from where the agent is, if it counts."""
+def _add(
+    estimate: TargetEstimate, direction: jax.Array, counts: jax.Array | bool
+) -> TargetEstimate:
+    """The estimate with one more ray from where the agent is, if `counts`."""
     across = jnp.eye(3) - direction[:, None] * direction
-    normal = sighting.normal + jnp.where(counts, across, 0.0)
-    return sighting.replace(normal=normal, moved=jnp.zeros((), bool))
+    normal = estimate.normal + jnp.where(counts, across, 0.0)
+    return estimate.replace(normal=normal, moved=jnp.zeros((), bool))
 
 
-def _choose(chosen: jax.Array, one: Sighting, other: Sighting) -> Sighting:
+def _choose(chosen: jax.Array, one: TargetEstimate, other: TargetEstimate) -> TargetEstimate:
     return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), one, other)
 
 
@@ -148,12 +165,12 @@ def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.sum(a * b, axis=-1)
 
 
-def _direction(place: jax.Array) -> jax.Array:
-    return place / jnp.maximum(jnp.linalg.norm(place), 1e-6)
+def _direction(position: jax.Array) -> jax.Array:
+    return position / jnp.maximum(jnp.linalg.norm(position), 1e-6)
 
 
 def _rays(boxes: jax.Array, heading: jax.Array, horizon: jax.Array) -> jax.Array:
-    """To the centres of boxes [K, 3], one metre deep in the image: [K, 3]."""
+    """Rays to the centres of boxes [K, 3], one metre deep along the optical axis: [K, 3]."""
     right, up = 2 * boxes[:, 0] - 1, 1 - 2 * boxes[:, 1]
     down = horizon * (jnp.pi / 6)
     ahead, up = jnp.cos(down) + up * jnp.sin(down), up * jnp.cos(down) - jnp.sin(down)
@@ -162,11 +179,11 @@ def _rays(boxes: jax.Array, heading: jax.Array, horizon: jax.Array) -> jax.Array
     return jnp.stack([right * cosine + ahead * sine, up, ahead * cosine - right * sine], axis=-1)
 
 
-def _solve(sighting: Sighting) -> tuple[jax.Array, jax.Array]:
-    """The place [3], and the weight of what is known of it along the line to it."""
-    a, b, c = sighting.normal
+def _solve(estimate: TargetEstimate) -> tuple[jax.Array, jax.Array]:
+    """The position [3], and the weight of the evidence along the line of sight."""
+    a, b, c = estimate.normal
     adjugate = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])  # symmetric
     inverse = adjugate / jnp.maximum(_dot(a, adjugate[0]), 1e-12)
-    place = _dot(inverse, sighting.moment)
-    direction = _direction(place)
-    return place, 1 / jnp.maximum(_dot(direction, _dot(inverse, direction)), 1e-6)
+    position = _dot(inverse, estimate.moment)
+    direction = _direction(position)
+    return position, 1 / jnp.maximum(_dot(direction, _dot(inverse, direction)), 1e-6)

@@ -19,11 +19,11 @@ from jax.sharding import Mesh
 
 from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import dynamics
-from tdanet_jax.env.dynamics import EnvParams
+from tdanet_jax.env.types import EnvParams, Observation
 from tdanet_jax.evaluation import episodes, policies, rollout, saved_networks
 from tdanet_jax.models import actor_critic, parameter_count
-from tdanet_jax.models.actor_critic import ODOMETRY_UNITS, ActorCritic
-from tdanet_jax.sensors import odometry, triangulation
+from tdanet_jax.models.actor_critic import SENSOR_UNITS, ActorCritic
+from tdanet_jax.sensors import suite
 from tdanet_jax.task import Task, load_task
 from tdanet_jax.training import devices, learner
 from tdanet_jax.vocabulary import NUM_ACTIONS
@@ -97,7 +97,7 @@ def environment_row(task: Task, count: int, observed: bool, repeats: int, mesh: 
         return jax.lax.with_sharding_constraint(tree, devices.split(mesh))
 
     @jax.jit
-    def play(key: jax.Array, params: dynamics.EnvParams) -> tuple[jax.Array, dynamics.Observation]:
+    def play(key: jax.Array, params: EnvParams) -> tuple[jax.Array, Observation]:
         reset_key, key = jax.random.split(key)
         keys = jax.random.split(reset_key, count)
         state = split(jax.vmap(dynamics.reset_state, (0, None))(keys, params))
@@ -177,10 +177,9 @@ def tdanet_forward_macs(model: ActorCritic, words_width: int) -> int:
     width, hidden = model.encoder.width, model.hidden
     encoder = (3 + words_width) * width + 3 * width * width
     action = NUM_ACTIONS * model.action_width
-    way = ODOMETRY_UNITS if model.odometry else 0
-    lstm = (width + way + model.action_width + hidden) * 4 * hidden
-    numbers = odometry.NUMBERS + (triangulation.NUMBERS if model.triangulation else 0)
-    return encoder + action + way * numbers + lstm + hidden * (NUM_ACTIONS + 1)
+    sensors = SENSOR_UNITS if model.spec.sensors else 0
+    lstm = (width + sensors + model.action_width + hidden) * 4 * hidden
+    return encoder + action + sensors * suite.width(model.spec) + lstm + hidden * (NUM_ACTIONS + 1)
 
 
 def update_cost(

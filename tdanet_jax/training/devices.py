@@ -121,7 +121,7 @@ def layout(state: Any, mesh: Mesh) -> Any:
     Raises:
       ValueError: the environments cannot be divided evenly.
     """
-    environments = state.fresh.shape[0]
+    environments = state.bootstrap_only.shape[0]
     if environments % mesh.size:
         raise ValueError(
             f"--num-envs {environments}: must be a multiple of the {mesh.size} devices"

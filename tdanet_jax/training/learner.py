@@ -18,30 +18,27 @@ from flax import struct
 
 from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import dynamics
-from tdanet_jax.env.dynamics import EnvParams, EnvState, Observation
+from tdanet_jax.env.types import EnvParams, EnvState, Observation
 from tdanet_jax.models import actor_critic
-from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.layers import Carry
+from tdanet_jax.models.actor_critic import ActorCritic, RecurrentState
+from tdanet_jax.models.activation_cache import ACTIVATIONS
 from tdanet_jax.training.gae import advantages
-from tdanet_jax.vocabulary import NUM_ACTIONS
 
-#: Parameters of more numbers than this have operands of the network's precision while acting.
+#: Kernels with more weights than this are cast to the network's precision once per rollout.
 SMALL = 2**16
 
 
 class TrainState(struct.PyTreeNode):
-    """All that a run needs to go on exactly where it was."""
+    """Everything that a run needs to resume exactly where it was."""
 
     #: Fields whose arrays have a row per environment.
-    PER_ENVIRONMENT: ClassVar = ("env_state", "held", "carry", "previous", "fresh")
+    PER_ENVIRONMENT: ClassVar = ("env_state", "bootstrap_only", "recurrent")
 
     params: Any
     opt_state: optax.OptState
     env_state: EnvState  # [B]
-    held: jax.Array  # [B] bool, the episode was truncated and waits to be valued
-    carry: Any  # recurrent state, a batch of B
-    previous: jax.Array  # [B, 6], action probabilities of the step before
-    fresh: jax.Array  # [B] bool, the episode has just begun
+    bootstrap_only: jax.Array  # [B] bool, the episode was truncated; its last state is to be valued
+    recurrent: RecurrentState  # [B]
     key: jax.Array  # the run's key; every update folds its number into it
     updates: jax.Array  # int32, updates done
     episodes: jax.Array  # int32, training episodes finished
@@ -52,17 +49,17 @@ class Rollout(NamedTuple):
     """T steps of B environments; every field is [T, B, ...]."""
 
     obs: Observation
-    previous: jax.Array
-    fresh: jax.Array
-    keep: jax.Array | None
+    prev_action_probs: jax.Array
+    is_first: jax.Array
+    dropout_mask: jax.Array | None
     tape: Any
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array
     reward: jax.Array
-    ended: jax.Array  # no bootstrap behind this step
-    held: jax.Array  # the step only valued the last state of a truncated episode
-    over: jax.Array  # an episode finished with this step
+    terminal: jax.Array  # no bootstrap after this step
+    bootstrap_only: jax.Array  # the step only valued the last state of a truncated episode
+    done: jax.Array  # an episode finished with this step
     success: jax.Array
     length: jax.Array
     shortest: jax.Array
@@ -96,10 +93,8 @@ def init(
         params=weights,
         opt_state=make_optimizer(config).init(weights),
         env_state=_reset(env_key, params, batch),
-        held=jnp.zeros(batch, bool),
-        carry=model.initial_carry(batch, weights, training=True),
-        previous=jnp.zeros((batch, NUM_ACTIONS)),
-        fresh=jnp.ones(batch, bool),
+        bootstrap_only=jnp.zeros(batch, bool),
+        recurrent=actor_critic.initial_state(model, weights, batch, training=True),
         key=run_key,
         updates=jnp.zeros((), jnp.int32),
         episodes=jnp.zeros((), jnp.int32),
@@ -130,63 +125,59 @@ def rollout(
     weights = jax.tree.map(
         lambda x: x.astype(model.dtype) if x.ndim > 1 and x.size > SMALL else x, state.params
     )
-    table = actor_critic.prepare(model, state.params, words)
+    class_table = actor_critic.prepare(model, state.params, words)
     rate = model.encoder.dropout
-    batch, units = state.fresh.shape[0], model.encoder.dropout_units
+    batch, units = config.num_envs, model.encoder.dropout_units
 
     def act(state: TrainState, step_key: jax.Array) -> tuple[TrainState, Rollout]:
         action_key, dropout_key, reset_key = jax.random.split(step_key, 3)
         obs = observe(state.env_state, params)
-        keep = _keep(dropout_key, rate, (batch, units)) if rate else None
-        carry, out, tape = actor_critic.record(
-            model, weights, table, state.carry, obs, state.previous, state.fresh, keep
+        mask = _dropout_mask(dropout_key, rate, (batch, units)) if rate else None
+        recurrent, out, kept = actor_critic.act(
+            model, weights, class_table, state.recurrent, obs, mask, collections=(ACTIVATIONS,)
         )
         log_probs = jax.nn.log_softmax(out.logits)
         action = jax.random.categorical(action_key, out.logits)
         moved = transition(state.env_state, action, params)
-        held = state.held
-        terminated, truncated = moved.terminated & ~held, moved.truncated & ~held
-        waits = truncated if config.bootstrap_truncated else jnp.zeros_like(truncated)
-        over = held | terminated | (truncated & ~waits)
+        only = state.bootstrap_only
+        terminated, truncated = moved.terminated & ~only, moved.truncated & ~only
+        valued_next = truncated if config.bootstrap_truncated else jnp.zeros_like(truncated)
+        terminal = only | terminated | (truncated & ~valued_next)
         begun = _reset(reset_key, params, batch)
-        following = dynamics.choose(over, begun, moved.state)
         step = Rollout(
             obs=obs,
-            previous=state.previous,
-            fresh=state.fresh,
-            keep=keep,
-            tape=tape,
+            prev_action_probs=state.recurrent.prev_action_probs,
+            is_first=state.recurrent.is_first,
+            dropout_mask=mask,
+            tape=kept.get(ACTIVATIONS, {}),
             action=action,
             log_prob=jnp.take_along_axis(log_probs, action[:, None], -1)[:, 0],
             value=out.value,
-            reward=jnp.where(held, 0.0, moved.reward),
-            ended=over,
-            held=held,
-            over=terminated | truncated,
-            success=moved.success & ~held,
+            reward=jnp.where(only, 0.0, moved.reward),
+            terminal=terminal,
+            bootstrap_only=only,
+            done=terminated | truncated,
+            success=moved.success & ~only,
             length=moved.state.steps,
             shortest=state.env_state.shortest,
         )
-        following_state = state.replace(
-            env_state=following,
-            held=waits,
-            carry=carry,
-            previous=jnp.where(over[:, None], 0.0, jnp.exp(log_probs)),
-            fresh=over,
+        following = state.replace(
+            env_state=dynamics.choose(terminal, begun, moved.state),
+            bootstrap_only=valued_next,
+            recurrent=recurrent.restarted(terminal),
         )
-        return following_state, step
+        return following, step
 
-    state = state.replace(carry=model.begin_rollout(state.carry))
+    carry = model.begin_rollout(state.recurrent.carry)
+    state = state.replace(recurrent=state.recurrent.replace(carry=carry))
     after, steps = jax.lax.scan(act, state, jax.random.split(key, config.rollout_steps))
     obs = observe(after.env_state, params)
-    _, out = actor_critic.forward(
-        model, weights, table, after.carry, obs, after.previous, after.fresh
-    )
+    _, out, _ = actor_critic.act(model, weights, class_table, after.recurrent, obs)
     return after, steps, out.value
 
 
-def _keep(key: jax.Array, rate: float, shape: tuple[int, ...]) -> jax.Array:
-    """Which units dropout keeps; the rate is rounded to 1/256, for a quarter of the random bits."""
+def _dropout_mask(key: jax.Array, rate: float, shape: tuple[int, ...]) -> jax.Array:
+    """Units that dropout keeps; the rate is rounded to 1/256, for a quarter of the random bits."""
     return jax.random.bits(key, shape, jnp.uint8) >= round(256 * rate)
 
 
@@ -194,7 +185,7 @@ def loss(
     weights: Any,
     steps: Rollout,
     advantage: jax.Array,
-    carry: Carry,
+    carry: Any,
     entropy_weight: jax.Array,
     config: LearnerConfig,
     model: ActorCritic,
@@ -204,10 +195,10 @@ def loss(
 
     The network's values are those recorded while acting; only the gradients are new work.
     """
-    table = actor_critic.prepare(model, weights, words)
-    seen = (steps.obs, steps.previous, steps.fresh, steps.keep)
-    _, out = actor_critic.forward(model, weights, table, carry, *seen, tape=steps.tape)
-    counted = ~steps.held
+    class_table = actor_critic.prepare(model, weights, words)
+    inputs = (steps.obs, steps.prev_action_probs, steps.is_first, steps.dropout_mask)
+    _, out = actor_critic.forward(model, weights, class_table, carry, *inputs, tape=steps.tape)
+    counted = ~steps.bootstrap_only
     count = counted.sum()
 
     def mean(x: jax.Array) -> jax.Array:
@@ -243,7 +234,7 @@ def update(
     key = jax.random.fold_in(state.key, state.updates)
     after, steps, last_value = rollout(state, key, config, model, words, params)
     advantage = advantages(
-        steps.reward, steps.value, last_value, steps.ended, steps.held, config.gamma,
+        steps.reward, steps.value, last_value, steps.terminal, steps.bootstrap_only, config.gamma,
         config.gae_lambda,
     )  # fmt: skip
 
@@ -252,7 +243,7 @@ def update(
 
     entropy_weight = mix(config.entropy_weight, config.final_entropy_weight)
     (total, parts), grads = jax.value_and_grad(loss, has_aux=True)(
-        state.params, steps, advantage, state.carry, entropy_weight, config, model, words
+        state.params, steps, advantage, state.recurrent.carry, entropy_weight, config, model, words
     )
     grad_norm = optax.tree.norm(grads)
     finite = jnp.isfinite(total) & jnp.isfinite(grad_norm)
@@ -265,12 +256,11 @@ def update(
         (weights, opt_state),
         (state.params, state.opt_state),
     )
-    finished = steps.over.sum()
     after = after.replace(
         params=weights,
         opt_state=opt_state,
         updates=state.updates + 1,
-        episodes=state.episodes + finished,
+        episodes=state.episodes + steps.done.sum(),
         skipped=state.skipped + ~finite,
     )
     metrics = {
@@ -284,23 +274,23 @@ def update(
 
 def _explained_variance(steps: Rollout, advantage: jax.Array) -> jax.Array:
     """1 - Var(return - value) / Var(return) over the steps that count; NaN if returns are alike."""
-    counted = ~steps.held
+    counted = ~steps.bootstrap_only
     rest = jnp.var(advantage, where=counted)
     return 1.0 - rest / jnp.var(steps.value + advantage, where=counted)
 
 
 def _episode_sums(steps: Rollout) -> dict[str, jax.Array]:
     """Sums over the episodes that finished in a rollout."""
-    success = (steps.success & steps.over).astype(jnp.float32)
+    success = (steps.success & steps.done).astype(jnp.float32)
     length = jnp.maximum(steps.length, 1)
     efficiency = success * steps.shortest / jnp.maximum(steps.shortest, length)
     return {
-        "episodes": steps.over.sum(),
+        "episodes": steps.done.sum(),
         "success_sum": success.sum(),
-        "spl_sum": jnp.where(steps.over, efficiency, 0.0).sum(),
-        "length_sum": jnp.where(steps.over, steps.length, 0).sum(),
+        "spl_sum": jnp.where(steps.done, efficiency, 0.0).sum(),
+        "length_sum": jnp.where(steps.done, steps.length, 0).sum(),
         "reward_sum": steps.reward.sum(),
-        "held_steps": steps.held.sum(),
+        "bootstrap_only_steps": steps.bootstrap_only.sum(),
     }
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from tdanet_jax.config import TrainConfig
-from tdanet_jax.env.dynamics import EnvParams
+from tdanet_jax.env.types import EnvParams
 from tdanet_jax.io import files
 from tdanet_jax.task import Task
 from tdanet_jax.training import devices, history, learner
@@ -243,7 +243,7 @@ class Run:
             "length": per_episode("length_sum"),
             "reward": float(metrics["reward_sum"].sum()) / steps,
             **{name: over_updates(name) for name in _UPDATE_MEANS},
-            "held_steps": int(metrics["held_steps"].sum()),
+            "bootstrap_only_steps": int(metrics["bootstrap_only_steps"].sum()),
             "skipped": int(self.state.skipped),
             "seconds": round(self.seconds, 3),
             "steps_per_second": round(steps / took, 1),

@@ -1,13 +1,12 @@
 """Three graph convolutions, relu(A X W), of nodes that share a part of their input.
 
-A node's input is the same for all nodes in its first part, what the frame shows, and its own in the
-second, its class's word vector. MJOLNIR and the scene priors are both made so.
+The first part of a node's input is what the frame shows, equal for all nodes; the second is its own
+class's word vector. MJOLNIR and the scene priors both have such nodes.
 
-Three equal, cheaper forms of the first layers are used; the tests of either model hold them equal
-to the published one. What nodes share makes the first layer an outer product with the row sums of
-A, and its part of word vectors is taken once per update. A and W are multiplied in the order that
-suits the layer. The batch lies between nodes and units, so that either product of a layer is one of
-two matrices.
+Equal but cheaper forms are used; the tests of either model compare them with the published one. The
+shared part makes the first layer an outer product with the row sums of A, and the word vectors'
+part is computed once per update. A and W are multiplied in the order that suits the layer. The
+batch axis is between nodes and units, so that either product of a layer is one of two matrices.
 """
 
 from __future__ import annotations
@@ -20,14 +19,15 @@ import jax.numpy as jnp
 from flax import linen as nn
 from flax import struct
 
-from tdanet_jax.models.layers import own_transpose, product, recorded
+from tdanet_jax.models.activation_cache import cached
+from tdanet_jax.models.matmul import materialized_transpose, product
 
-#: Matrix units want sizes that this divides; zeros fill up what is missing.
+#: Sizes are padded with zeros to multiples of this, which matrix units need.
 ROUND = 32
 
 
 class Convolutions(struct.PyTreeNode):
-    """What the three layers of n nodes, h units and u units at the end are made of."""
+    """The weights of the three layers, for n nodes with h units, and u after the last layer."""
 
     words: jax.Array  # [n, h], A E W0 of the word vectors E
     degree: jax.Array  # [n], row sums of A
@@ -51,26 +51,28 @@ class Convolutions(struct.PyTreeNode):
 class Layers(NamedTuple):
     """The layers of a batch, one by one."""
 
-    first: jax.Array  # [n, B, h], behind A X W0 and ReLU
+    first: jax.Array  # [n, B, h], A X W0 after ReLU
     mixed: jax.Array  # [n, B, h], first W1
-    second: jax.Array  # [n, B, h], behind A mixed and ReLU
+    second: jax.Array  # [n, B, h], A mixed after ReLU
     lower: jax.Array  # [n, B u], second W2
     last: jax.Array  # [n, B u], A lower
 
 
 def apply(module: nn.Module, weights: Convolutions, shared: jax.Array, dtype: Any) -> jax.Array:
-    """The nodes' numbers behind three layers, [..., n, u]; the tape of `module` keeps them.
+    """The nodes' numbers after three layers, [..., n, u], through the activation cache.
 
     Args:
-      shared: [B, h] or [T, B, h], the product of what the nodes share and its rows of W0.
+      module: the module whose cache is used.
+      weights: of the layers.
+      shared: [B, h] or [T, B, h], the product of the shared input and its rows of W0.
       dtype: operands of the large products.
     """
     count, width = weights.words.shape
     shared = jnp.pad(shared, ((0, 0),) * (shared.ndim - 1) + ((0, -width % ROUND),))
     padded = weights.padded()
-    given = jax.lax.stop_gradient((padded, shared))
-    found = recorded(module, "nodes", lambda: forward(*given, dtype))
-    return convolve(padded, shared, dtype, found)[..., :count, :]
+    constant = jax.lax.stop_gradient((padded, shared))
+    value = cached(module, "nodes", lambda: forward(*constant, dtype))
+    return convolve(padded, shared, dtype, value)[..., :count, :]
 
 
 def layers_of(weights: Convolutions, shared: jax.Array, dtype: Any) -> Layers:
@@ -93,38 +95,38 @@ def forward(weights: Convolutions, shared: jax.Array, dtype: Any) -> jax.Array:
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def convolve(weights: Convolutions, shared: jax.Array, dtype: Any, found: jax.Array) -> jax.Array:
-    """`forward(weights, shared, dtype)`, which has given `found`; shared [B, h] or [T, B, h].
+def convolve(weights: Convolutions, shared: jax.Array, dtype: Any, value: jax.Array) -> jax.Array:
+    """`forward(weights, shared, dtype)` with a known value; shared [B, h] or [T, B, h].
 
-    The backward pass goes through one step at a time and computes its layers again, so that nothing
-    but the results is kept: those of a rollout would fill the memory.
+    The backward pass goes through one step at a time and computes its layers again, so that only the
+    results are stored: the layers of a rollout would fill the memory.
     """
-    return found
+    return value
 
 
 def _convolve_fwd(
-    weights: Convolutions, shared: jax.Array, dtype: Any, found: jax.Array
+    weights: Convolutions, shared: jax.Array, dtype: Any, value: jax.Array
 ) -> tuple[jax.Array, tuple[Convolutions, jax.Array]]:
-    return found, (weights, shared)
+    return value, (weights, shared)
 
 
 def _convolve_bwd(
     dtype: Any, saved: tuple[Convolutions, jax.Array], cotangent: jax.Array
 ) -> tuple[Convolutions, jax.Array, None]:
     weights, shared = saved
-    back = own_transpose(weights.adjacency, dtype), own_transpose(weights.second, dtype)
+    transposed = [materialized_transpose(w, dtype) for w in (weights.adjacency, weights.second)]
 
     def body(
         total: Convolutions, step: tuple[jax.Array, jax.Array]
     ) -> tuple[Convolutions, jax.Array]:
-        found, of_shared = gradient(weights, back, *step, dtype)
-        return jax.tree.map(jnp.add, total, found), of_shared
+        grads, grad_shared = gradient(weights, *transposed, *step, dtype)
+        return jax.tree.map(jnp.add, total, grads), grad_shared
 
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape), weights)
     steps = shared.reshape(-1, *shared.shape[-2:]), cotangent.reshape(-1, *cotangent.shape[-3:])
-    total, of_shared = jax.lax.scan(body, zeros, steps)
+    total, grad_shared = jax.lax.scan(body, zeros, steps)
     total = jax.tree.map(lambda x, w: x.astype(w.dtype), total, weights)
-    return total, of_shared.reshape(shared.shape), None
+    return total, grad_shared.reshape(shared.shape), None
 
 
 convolve.defvjp(_convolve_fwd, _convolve_bwd)
@@ -132,15 +134,18 @@ convolve.defvjp(_convolve_fwd, _convolve_bwd)
 
 def gradient(
     weights: Convolutions,
-    back: tuple[jax.Array, jax.Array],
+    adjacency_transposed: jax.Array,
+    second_transposed: jax.Array,
     shared: jax.Array,
     cotangent: jax.Array,
     dtype: Any,
 ) -> tuple[Convolutions, jax.Array]:
-    """The gradient of `forward` in its weights and in shared, of one step.
+    """The gradient of `forward` with respect to its weights and `shared`, of one step.
 
     Args:
-      back: A and W1 transposed, as arrays of their own.
+      weights: of the layers.
+      adjacency_transposed: A transposed and materialized.
+      second_transposed: W1 transposed and materialized.
       shared: [B, h].
       cotangent: [B, n, u].
       dtype: operands of the large products.
@@ -153,17 +158,17 @@ def gradient(
     second = lower @ weights.third.astype(jnp.float32).T
     second = jnp.where(at.second.reshape(-1, width) > 0, second, 0.0).astype(dtype)
     second = second.reshape(count, -1)
-    mixed = product(back[0], second, dtype).astype(dtype).reshape(-1, width)
-    # The first layer transposed is made anew, unit by unit: large transposed operands are slow.
+    mixed = product(adjacency_transposed, second, dtype).astype(dtype).reshape(-1, width)
+    # The first layer's transpose is computed anew, unit by unit: large transposes are slow.
     turned = shared.T[:, None] * weights.degree[:, None] + weights.words.T[..., None]
-    first = product(mixed, back[1], dtype).reshape(at.first.shape)
+    first = product(mixed, second_transposed, dtype).reshape(at.first.shape)
     first = jnp.where(at.first > 0, first, 0.0)
     adjacency = product(second, at.mixed.reshape(count, -1).T, dtype)
-    found = Convolutions(
+    grads = Convolutions(
         words=first.sum(axis=1),
         degree=jnp.einsum("nbh,bh->n", first, shared),
         adjacency=adjacency + last @ at.lower.T,
         second=product(nn.relu(turned).astype(dtype).reshape(width, -1), mixed, dtype),
         third=at.second.reshape(-1, width).T.astype(jnp.float32) @ lower,
     )
-    return found, jnp.einsum("nbh,n->bh", first, weights.degree)
+    return grads, jnp.einsum("nbh,n->bh", first, weights.degree)

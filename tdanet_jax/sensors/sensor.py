@@ -1,0 +1,77 @@
+"""The interface of a sensor: what an agent perceives in addition to its detections.
+
+A sensor is one file with a function `make() -> Sensor`, here or anywhere that Python finds it.
+`observation_spec.SENSORS` gives the built-in ones short names; `--sensors` takes the dotted name of
+any other. The environment and an agent on a robot run the same functions, so a sensor is told only
+what a robot knows: how it faces at the start, its own actions, whether it was blocked, and its
+detections. All methods work on one episode, and under `jit` and `vmap`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+
+
+class Start(NamedTuple):
+    """How the agent faces at the start of an episode."""
+
+    rotation: jax.Array  # int32, 0 to 7: steps of 45 degrees clockwise from the grid's z axis
+    horizon: jax.Array  # int32, 1 while looking 30 degrees down, else 0
+
+
+class Motion(NamedTuple):
+    """The last action, and whether it failed."""
+
+    action: jax.Array  # int32; 6 before the first action, which changes nothing
+    blocked: jax.Array  # bool, the agent did not move; only meaningful after a MoveAhead
+
+
+class Frame(NamedTuple):
+    """The detections in view."""
+
+    classes: jax.Array  # [K] int32, 0 in padding
+    boxes: jax.Array  # [K, 3] float32, x, y, S: box centre and area as shares of the image
+    mask: jax.Array  # [K] bool, False in padding
+    target: jax.Array  # int32, class of the target
+
+
+class Sensor:
+    """Base class of the sensors.
+
+    A state and a reading are arrays, or trees of arrays. `others` holds the states of the sensors
+    that come before this one, by name, as they are at the same moment.
+
+    Attributes:
+      REQUIRES: names of sensors that must come before it.
+      width: length of `features`.
+    """
+
+    REQUIRES: ClassVar[tuple[str, ...]] = ()
+    width: int
+
+    def init(self, start: Start) -> Any:
+        """The state at the start of an episode, before the first frame."""
+        raise NotImplementedError
+
+    def update(self, state: Any, motion: Motion, others: Mapping[str, Any]) -> Any:
+        """The state after an action."""
+        return state
+
+    def observe(self, state: Any, frame: Frame, others: Mapping[str, Any]) -> Any:
+        """The state after a frame has been seen."""
+        return state
+
+    def clear(self, state: Any, changed: jax.Array) -> Any:
+        """The state once the agent may have been given another target; `changed` is a bool."""
+        return state
+
+    def read(self, state: Any, others: Mapping[str, Any]) -> Any:
+        """What the sensor says now; the observation holds it."""
+        return state
+
+    def features(self, reading: Any) -> jax.Array:
+        """Readings with leading axes [...] as the network's input, [..., width] float32."""
+        return reading
