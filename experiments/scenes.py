@@ -407,7 +407,9 @@ class Export:
             tables = tables.subset(self.scenes)
         vectors = None
         if self.vectors:
-            vectors = words.load(self.word_vectors, tables.classes).table(tables.classes, None)
+            vectors = words.load_word_vectors(self.word_vectors, tables.classes).table(
+                tables.classes, None
+            )
         with reporter("export") as report:
             exporter.write_folder(tables, self.out, report, parents, vectors, self.features)
         console.print(f"{self.out}")

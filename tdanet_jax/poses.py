@@ -1,8 +1,7 @@
 """A pose as one number: (position * 8 + rotation) * 2 + horizon.
 
-Positions count a table's reachable points. Rotations are 45 degrees apart, clockwise from +z;
-horizon 0 looks level, 1 looks 30 degrees down. Where nothing else depends on the pose, the tables
-call it a state.
+A position is the index of a reachable point in the tables. Rotations are 45 degrees apart,
+clockwise from +z; horizon 0 is level, 1 looks 30 degrees down. Scene tables call a pose a state.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ ROTATIONS = 8
 HORIZONS = 2
 #: Grid cells (x, z) that MoveAhead moves along each rotation; both axes along a diagonal.
 STEPS = np.array([(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)])
-#: Poses at a position.
+#: Poses per position.
 VIEWS = ROTATIONS * HORIZONS
 
 #: A whole number, or an array of them, of NumPy or of JAX.

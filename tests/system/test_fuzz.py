@@ -94,7 +94,7 @@ def seeds(root: Path) -> list[tuple[Path, Callable[[Path], object]]]:
         (root / "data" / "gcn" / "adjmat.dat", read_matrix),
         (root / "tensors.pkl", read_tensor),
         (root / "rooms.npz", dataset.load),
-        (root / "glove.txt", words.load),
+        (root / "glove.txt", words.load_word_vectors),
         *features(root),
     ]
 

@@ -1,4 +1,4 @@
-"""Reading files that nobody vouches for: plain data or one line that says what is wrong."""
+"""Parsers for untrusted files: they return plain data, or fail with one line that says why."""
 
 from __future__ import annotations
 

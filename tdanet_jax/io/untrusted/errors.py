@@ -1,12 +1,12 @@
-"""The one error that broken or hostile files raise."""
+"""The error that broken or malicious files raise."""
 
 from __future__ import annotations
 
-LONGEST = 200  # characters of a reason; what a library says of a broken file may be endless
+LONGEST = 200  # characters of a reason; a library may have much to say about a broken file
 
 
 class FileError(ValueError):
-    """A file is not what it should be; the message is one line: the file, then the reason."""
+    """A file is not valid; the message is one line: the file, then the reason."""
 
     def __init__(self, path: object, reason: object) -> None:
         plain = " ".join(str(reason).split())

@@ -1,4 +1,4 @@
-"""HDF5 from outside: hard-linked, plainly stored, small datasets of numbers, and nothing else."""
+"""Untrusted HDF5 files: only small numeric datasets that are stored in the file itself."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tdanet_jax.io.untrusted.errors import FileError
 
 #: Numbers in the largest dataset that is read; a feature map has 512 x 7 x 7.
 LARGEST = 1 << 22
-#: HDF5's codes of the filters that come with it: deflate, shuffle, checksum; and h5py's lzf.
+#: Filters that are read: HDF5's own deflate, shuffle and checksum, and h5py's lzf.
 _FILTERS = (1, 2, 3, 32000)
 
 
@@ -25,7 +25,7 @@ class Reader:
         self._file = file
 
     def names(self) -> list[str]:
-        """Names at the top of the file."""
+        """Names at the top level of the file."""
         with _plain_errors(self._path):
             return [str(name) for name in self._file]
 
@@ -37,18 +37,18 @@ class Reader:
         """The numbers of a dataset.
 
         Args:
-          shape: what its shape must be, if that is known.
+          shape: the shape that it must have; None accepts any.
 
         Raises:
-          FileError: it is a link to elsewhere, is stored elsewhere, too large, not numbers, not
-            finite, or of another shape.
+          FileError: it is a link, is stored in another file, too large, not numeric, not finite,
+            or of another shape.
         """
         import h5py
 
         with _plain_errors(self._path):
             link = self._file.get(name, getlink=True)
             if not isinstance(link, h5py.HardLink):
-                raise FileError(self._path, f"{name} is a link to elsewhere")
+                raise FileError(self._path, f"{name} is a link")
             dataset = self._file[name]
             if not isinstance(dataset, h5py.Dataset):
                 raise FileError(self._path, f"{name} is not a dataset")
@@ -59,11 +59,11 @@ class Reader:
         return value
 
     def _check(self, name: str, dataset: Any, shape: tuple[int, ...] | None) -> None:
-        """Refuses what may not be read, before any of it is."""
+        """Refuses a dataset before anything of it is read."""
         if dataset.external or dataset.is_virtual:
             raise FileError(self._path, f"{name} is stored in another file")
         if dataset.shape is None or dataset.dtype.kind not in "fiu":
-            raise FileError(self._path, f"{name} holds no numbers")
+            raise FileError(self._path, f"{name} is not numeric")
         if shape is not None and dataset.shape != shape:
             raise FileError(self._path, f"{name} has shape {dataset.shape}, not {shape}")
         largest = max(_count(dataset.shape), _count(dataset.chunks or ()))
@@ -71,7 +71,7 @@ class Reader:
             raise FileError(self._path, f"{name} has {largest} numbers, more than {LARGEST}")
         stored = dataset.id.get_create_plist()
         if any(stored.get_filter(i)[0] not in _FILTERS for i in range(stored.get_nfilters())):
-            raise FileError(self._path, f"{name} is compressed in a way that is not read here")
+            raise FileError(self._path, f"{name} has an unsupported compression filter")
 
 
 def _count(shape: tuple[int, ...]) -> int:
@@ -82,7 +82,7 @@ def _count(shape: tuple[int, ...]) -> int:
 
 
 def need_h5py(path: Path) -> None:
-    """Raises FileError, before a file is read or written, if h5py is not installed."""
+    """Raises FileError if h5py, which reads and writes `path`, is not installed."""
     try:
         import h5py  # noqa: F401
     except ImportError:
@@ -91,10 +91,10 @@ def need_h5py(path: Path) -> None:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Reader]:
-    """Opens a file to read from it.
+    """Opens a file for reading.
 
     Raises:
-      FileError: it is missing or no HDF5 file, or h5py is not installed.
+      FileError: it is missing or not an HDF5 file, or h5py is not installed.
     """
     need_h5py(path)
     import h5py
@@ -109,7 +109,7 @@ def opened(path: Path) -> Iterator[Reader]:
 
 @contextlib.contextmanager
 def _plain_errors(path: Path) -> Iterator[None]:
-    """Whatever h5py raises about a broken file becomes one line."""
+    """Turns whatever h5py raises about a broken file into one line."""
     try:
         yield
     except FileError:

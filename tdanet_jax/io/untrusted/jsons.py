@@ -1,4 +1,4 @@
-"""JSON from outside: no NaN, no endless files, and large objects one member at a time."""
+"""Untrusted JSON: no NaN, a limit on size, and large objects read one member at a time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def load(path: Path) -> Any:
 
 
 def members(path: Path) -> Iterator[tuple[str, Any]]:
-    """Names and values of the one object in a JSON file, decoded one after the other.
+    """Names and values of the object in a JSON file, decoded one after the other.
 
     Raises:
       FileError: the file is missing, too large, or not a JSON object.
@@ -60,14 +60,14 @@ def members(path: Path) -> Iterator[tuple[str, Any]]:
 
 
 def number(path: Path | str, value: Any, what: str, most: float) -> float:
-    """A finite number of at most `most` in size.
+    """`value` as a float, if it is a finite number of magnitude `most` at most.
 
     Raises:
-      FileError: it is none; the message names `what`.
+      FileError: it is not; the message names `what`.
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise FileError(path, f"{what} is not a number")
-    if not -most <= value <= most:  # so for NaN, too
+    if not -most <= value <= most:  # NaN as well
         raise FileError(path, f"{what} is not finite or above {most:g}")
     return float(value)
 

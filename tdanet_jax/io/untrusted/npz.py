@@ -1,4 +1,4 @@
-"""NumPy archives from outside: arrays of plain numbers, their sizes known before they are read."""
+"""Untrusted npz archives: numeric arrays, whose sizes are checked before they are read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
     """All arrays of an npz.
 
     Raises:
-      FileError: it is no such file, is damaged, or holds objects or names of other places.
+      FileError: it is missing or damaged, or holds Python objects or names outside the archive.
     """
     if not path.is_file():
         raise FileError(path, "no such file")
@@ -32,10 +32,10 @@ def read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _array(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
-    """One array, its size known from its header before it is read."""
+    """One array, whose size is checked against its header before it is read."""
     name = entry.filename
     if not name.endswith(".npy") or ".." in name or name.startswith("/") or "\\" in name:
-        raise FileError(path, f"{name!r} is no name of an array")
+        raise FileError(path, f"{name!r} is not the name of an array")
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)
         read_header = np.lib.format.read_array_header_1_0
@@ -44,7 +44,7 @@ def _array(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.n
         shape, by_column, dtype = read_header(file)
         size = math.prod(shape) * dtype.itemsize
         if dtype.hasobject or dtype.itemsize == 0:
-            raise FileError(path, f"{name} holds no numbers")
+            raise FileError(path, f"{name} is not numeric")
         if size > LARGEST or size > entry.file_size:
             raise FileError(path, f"{name} is damaged: its size is not the one in its header")
         order: Literal["F", "C"] = "F" if by_column else "C"

@@ -1,11 +1,11 @@
-"""Plain values out of pickles from outside. Nothing is imported and nothing is called.
+"""Untrusted pickles, as plain values. Nothing is imported and nothing is called.
 
-A small machine runs the opcodes, decoded by the standard library's `pickletools`, and notes
-down what the pickle would have built: a `Call` with a name and arguments. Functions here then read
-the few shapes that are known: arrays and tensors. A name that is not on the list ends the reading.
+A small interpreter runs the opcodes, which the standard library's `pickletools` decodes, and
+records what the pickle would have built: a `Call` with a name and arguments. Of these, NumPy arrays
+and torch tensors are understood. A name that is not on the list is an error.
 
-torch.save's two formats are read as well: several pickles and the tensors' bytes one after the
-other, and a zip file. A tensor inside a plain pickle carries the former as bytes.
+Both formats of torch.save are read: several pickles followed by the tensors' bytes, and a zip
+file. A tensor inside a plain pickle contains the first format as bytes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tdanet_jax.io.untrusted.errors import FileError
 
 #: Numbers in the largest array, and bytes of the largest file that is read.
 LARGEST, LARGEST_FILE = 1 << 24, 1 << 30
-AGENT_STATE = "ThorAgentState"  # of any module: the reference's forks moved it about
+AGENT_STATE = "ThorAgentState"  # of any module: forks of the reference moved it
 _STORAGES = {
     "FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2", "LongStorage": "<i8",
     "IntStorage": "<i4", "ShortStorage": "<i2", "ByteStorage": "u1", "CharStorage": "i1",
@@ -42,7 +42,7 @@ _MAGIC, _PROTOCOL = 0x1950A86A20F9469CFC6C, 1001
 
 @dataclass
 class Name:
-    """A class or function that a pickle names; never looked up."""
+    """A class or function that a pickle names; it is never looked up."""
 
     name: str
 
@@ -58,7 +58,7 @@ class Call:
 
 @dataclass
 class Storage:
-    """The numbers behind a tensor; they follow later in the file."""
+    """The data of a tensor, which follow later in the file."""
 
     dtype: str
     key: str
@@ -81,22 +81,22 @@ class _Machine:
     storages: list[Storage] = field(default_factory=list)
 
     def run(self, stream: io.BytesIO) -> Any:
-        """The value of the pickle at the stream's position, which moves behind it."""
+        """The value of the pickle at the stream's position, which moves past it."""
         for opcode, argument, _ in pickletools.genops(stream):
             if opcode.name == "STOP":
                 return self.stack.pop()
             if opcode.name in _PUSHED:
                 self.stack.append(argument)
-            elif opcode.name in _FRESH:
-                self.stack.append(_FRESH[opcode.name]())
+            elif opcode.name in _EMPTY:
+                self.stack.append(_EMPTY[opcode.name]())
             elif opcode.name in _STEPS:
                 _STEPS[opcode.name](self, argument)
             elif opcode.name not in ("PROTO", "FRAME"):
-                raise FileError(self.path, f"a pickle with {opcode.name}, which is not read here")
+                raise FileError(self.path, f"a pickle with {opcode.name}, which is not supported")
         raise FileError(self.path, "a pickle without an end")
 
     def above_mark(self) -> list:
-        """Takes everything above the last mark, and the mark, off the stack."""
+        """Pops everything above the last mark, and the mark."""
         items = []
         while not isinstance(item := self.stack.pop(), _Mark):
             items.append(item)
@@ -115,7 +115,7 @@ class _Machine:
 
     def push_name(self, name: str) -> None:
         if name not in _ALLOWED and name.rpartition(".")[2] != AGENT_STATE:
-            raise FileError(self.path, f"a pickle names {name}, which such a file does not hold")
+            raise FileError(self.path, f"a pickle names {name}, which such a file does not need")
         self.stack.append(Name(name))
 
     def push_named(self) -> None:
@@ -125,13 +125,13 @@ class _Machine:
     def call(self) -> None:
         arguments, function = self.stack.pop(), self.stack.pop()
         if not isinstance(function, Name) or not isinstance(arguments, tuple):
-            raise FileError(self.path, "a pickle calls what is no function")
+            raise FileError(self.path, "a pickle calls something that is not a function")
         self.stack.append(Call(function.name, arguments))
 
     def build(self) -> None:
         state = self.stack.pop()
         if not isinstance(self.stack[-1], Call):
-            raise FileError(self.path, "a pickle sets the state of what has none")
+            raise FileError(self.path, "a pickle sets the state of something without one")
         self.stack[-1].state = state
 
     def append(self, items: list) -> None:
@@ -141,13 +141,15 @@ class _Machine:
         top = self.stack[-1]
         target = {} if isinstance(top, Call) else self._top(dict)  # an OrderedDict's are not needed
         for key, value in zip(items[::2], items[1::2], strict=True):
-            if not isinstance(key, str | int | bytes):  # others may be too deep to be hashed
-                raise FileError(self.path, "a pickle with an odd dictionary")
+            if not isinstance(key, str | int | bytes):  # hashing others may recurse too deeply
+                raise FileError(self.path, "a pickle with unsupported dictionary keys")
             target[key] = value
 
     def _top(self, kind: type) -> Any:
         if not isinstance(self.stack[-1], kind):
-            raise FileError(self.path, f"a pickle fills what is no {kind.__name__}")
+            raise FileError(
+                self.path, f"a pickle adds items to something other than a {kind.__name__}"
+            )
         return self.stack[-1]
 
     def push_storage(self) -> None:
@@ -162,7 +164,7 @@ class _Machine:
             case _:
                 dtype = None
         if dtype is None or not 0 <= count <= LARGEST:
-            raise FileError(self.path, "a pickle with a storage that is not read here")
+            raise FileError(self.path, "a pickle with an unsupported storage")
         known = [other for other in self.storages if other.key == key]
         storage = known[0] if known else Storage(dtype, key, count)
         if not known:
@@ -175,17 +177,17 @@ _PUSHED = {
     "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "UNICODE",
     "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8",
 }  # fmt: skip
-_FRESH: dict[str, Callable[[], Any]] = {
+_EMPTY: dict[str, Callable[[], Any]] = {
     "NONE": lambda: None, "NEWTRUE": lambda: True, "NEWFALSE": lambda: False, "MARK": _Mark,
     "EMPTY_TUPLE": tuple, "EMPTY_LIST": list, "EMPTY_DICT": dict,
 }  # fmt: skip
 
 
-def _remember(machine: _Machine, argument: Any) -> None:
+def _put(machine: _Machine, argument: Any) -> None:
     machine.memo[len(machine.memo) if argument is None else argument] = machine.stack[-1]
 
 
-def _recall(machine: _Machine, argument: Any) -> None:
+def _get(machine: _Machine, argument: Any) -> None:
     machine.stack.append(machine.memo[argument])
 
 
@@ -196,8 +198,8 @@ def _pair(machine: _Machine) -> list:
 
 _STEPS: dict[str, Callable[[_Machine, Any], None]] = {
     "POP": lambda m, _: m.drop(),
-    "PUT": _remember, "BINPUT": _remember, "LONG_BINPUT": _remember, "MEMOIZE": _remember,
-    "GET": _recall, "BINGET": _recall, "LONG_BINGET": _recall,
+    "PUT": _put, "BINPUT": _put, "LONG_BINPUT": _put, "MEMOIZE": _put,
+    "GET": _get, "BINGET": _get, "LONG_BINGET": _get,
     "TUPLE": lambda m, _: m.stack.append(tuple(m.above_mark())),
     "TUPLE1": lambda m, _: m.push_tuple(1),
     "TUPLE2": lambda m, _: m.push_tuple(2),
@@ -221,10 +223,10 @@ def load(data: bytes, path: object) -> Any:
     """The value of a pickle: plain values, `Call`s and `Name`s.
 
     Args:
-      path: names the file in messages.
+      path: the file's name in messages.
 
     Raises:
-      FileError: it is no pickle, or holds something that is not on the list.
+      FileError: it is not a pickle, or holds something that is not on the list.
     """
     return _run(io.BytesIO(data), str(path))[0]
 
@@ -233,7 +235,7 @@ def load_torch(data: bytes, path: object) -> Any:
     """The value of a file that torch.save wrote, in either of its formats.
 
     Raises:
-      FileError: it is no such file, or holds something that is not on the list.
+      FileError: it is not such a file, or holds something that is not on the list.
     """
     if data[:2] == b"PK":
         return _load_zip(data, str(path))
@@ -284,7 +286,7 @@ def _load_zip(data: bytes, path: str) -> Any:
 def _run(stream: io.BytesIO, path: str) -> tuple[Any, list[Storage]]:
     machine = _Machine(path)
     try:
-        with warnings.catch_warnings(action="ignore"):  # pickletools' own, about odd escapes
+        with warnings.catch_warnings(action="ignore"):  # of pickletools, about escapes
             return machine.run(stream), machine.storages
     except FileError:
         raise
@@ -296,7 +298,7 @@ def array(value: Any, path: object) -> np.ndarray:
     """The numbers of a pickled NumPy array or torch tensor.
 
     Raises:
-      FileError: it is neither, or not of plain numbers, or too large.
+      FileError: it is neither, not numeric, or too large.
     """
     try:
         if isinstance(value, Call) and value.name in _ARRAY:
@@ -305,7 +307,7 @@ def array(value: Any, path: object) -> np.ndarray:
             return _tensor(value, path)
     except FileError:
         raise
-    except Exception as error:  # whatever does not fit the shapes
+    except Exception as error:  # whatever does not have the expected form
         raise FileError(path, f"a broken array ({error or type(error).__name__})") from None
     raise FileError(path, "something other than an array")
 
@@ -315,7 +317,7 @@ def _numpy_array(value: Call) -> np.ndarray:
     code = dtype.arguments[0]
     order = dtype.state[1]
     if dtype.name != _DTYPE or code not in _NUMBERS or order not in ("<", ">", "|", "="):
-        raise ValueError("not numbers")
+        raise ValueError("not numeric")
     numbers = np.frombuffer(_octets(data), np.dtype(code).newbyteorder(order))
     if len(numbers) > LARGEST:
         raise ValueError("too large")
@@ -331,7 +333,7 @@ def _octets(data: Any) -> bytes:
     if isinstance(data, Call) and data.name == _BYTES and data.arguments[1:] == ("latin1",):
         return data.arguments[0].encode("latin-1")
     if not isinstance(data, bytes):
-        raise ValueError("no bytes")
+        raise ValueError("not bytes")
     return data
 
 
@@ -343,10 +345,10 @@ def _tensor(value: Call, path: object) -> np.ndarray:
         kind = _STORAGES[storage.name.rpartition(".")[2]]
         storage = Storage(kind, "", 0, np.array(storage.arguments[0], kind))
     if not isinstance(storage, Storage) or storage.values is None:
-        raise ValueError("a tensor without numbers")
+        raise ValueError("a tensor without data")
     sizes, steps = _sizes(shape), _sizes(strides)
     if len(sizes) != len(steps) or math.prod(sizes) > LARGEST:
-        raise ValueError("a tensor of an odd shape")
+        raise ValueError("a tensor with an invalid shape")
     place = np.full(sizes, int(first), np.int64)
     for axis, (size, step) in enumerate(zip(sizes, steps, strict=True)):
         along = [1] * len(sizes)
@@ -358,8 +360,7 @@ def _tensor(value: Call, path: object) -> np.ndarray:
 
 
 def _sizes(values: Any) -> tuple[int, ...]:
-    if not all(isinstance(v, int) and not isinstance(v, bool) for v in values):
-        raise ValueError("an odd shape")
-    if len(values) > 8 or not all(0 <= v <= LARGEST for v in values):
-        raise ValueError("an odd shape")
+    whole = all(isinstance(v, int) and not isinstance(v, bool) for v in values)
+    if not whole or len(values) > 8 or not all(0 <= v <= LARGEST for v in values):
+        raise ValueError("an invalid shape")
     return tuple(values)

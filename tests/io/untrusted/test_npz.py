@@ -39,7 +39,7 @@ def test_arrays_come_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["../a.npy", "/etc/a.npy", "a/../../b.npy", "a\\b.npy", "a.txt"])
 def test_names_of_other_places(tmp_path: Path, name: str) -> None:
     path = packed(tmp_path / "a.npz", **{name: npy(np.zeros(3))})
-    with pytest.raises(FileError, match=r"a\.npz: .* is no name of an array"):
+    with pytest.raises(FileError, match=r"a\.npz: .* is not the name of an array"):
         npz.read(path)
     assert [p.name for p in tmp_path.rglob("*")] == ["a.npz"]
 
@@ -47,7 +47,7 @@ def test_names_of_other_places(tmp_path: Path, name: str) -> None:
 def test_objects_sizes_and_damage(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     np.savez(path, a=np.array([print], object))
-    with pytest.raises(FileError, match="holds no numbers"):
+    with pytest.raises(FileError, match="is not numeric"):
         npz.read(path)
     huge = npy(np.zeros(3)).replace(
         b"'shape': (3,), }" + b" " * 12, b"'shape': (1000000000000,), }"

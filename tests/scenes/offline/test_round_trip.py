@@ -162,7 +162,7 @@ def test_what_older_code_reads(some_rooms: SceneTables, tmp_path: Path) -> None:
             shown = np.where(values.any(axis=0), values.argmax(axis=0), -1)
             np.testing.assert_array_equal(shown, room.raster[state])
             assert set(np.unique(values)) <= {0.0, 1.0}
-    stored = words.load(out / "thor_glove" / "glove_map50d.hdf5")
+    stored = words.load_word_vectors(out / "thor_glove" / "glove_map50d.hdf5")
     np.testing.assert_allclose(stored.table(room.classes), glove.table(room.classes), atol=1e-6)
 
     sources = importer.find_features(out)
