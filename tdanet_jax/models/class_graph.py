@@ -1,9 +1,9 @@
 """The class graph: which classes stand near each other in the training rooms.
 
 Two classes are joined if at least `MIN_ROOMS` training rooms hold both, and if in at least
-`MIN_SHARE` of those their nearest instances are within 1.5 m, centre to centre. Nodes are the
-classes that training may know: the graph is built from rooms that went through the zero-shot
-filter. A graph from elsewhere, such as the one of an imported data set, can take its place.
+`MIN_SHARE` of those rooms their nearest instances are within 1.5 m, centre to centre. Nodes are the
+classes that training may know: the graph is built from rooms that passed the zero-shot filter.
+Another graph, such as that of an imported data set, can replace it.
 """
 
 from __future__ import annotations
@@ -11,12 +11,11 @@ from __future__ import annotations
 import numpy as np
 
 from tdanet_jax.env.reward import NEAR
-from tdanet_jax.models.classes import Classes
 from tdanet_jax.scenes.tables import SceneTables
 
-#: Fewest rooms that say something about a pair of classes.
+#: Fewest rooms that hold both classes of an edge.
 MIN_ROOMS = 2
-#: Share of the rooms holding both classes in which they are near each other.
+#: Least share of the rooms holding both classes in which they are near each other.
 MIN_SHARE = 0.5
 
 
@@ -24,7 +23,7 @@ def co_occurrence(tables: SceneTables) -> np.ndarray:
     """The adjacency between the C classes of these rooms.
 
     Args:
-      tables: training rooms only, and without the classes that training must not know.
+      tables: training rooms only, without the classes that training must not know.
 
     Returns:
       [C, C] float32, symmetric, 1 where two different classes are joined, else 0.
@@ -46,20 +45,3 @@ def co_occurrence(tables: SceneTables) -> np.ndarray:
     joined = (both >= MIN_ROOMS) & (near >= MIN_SHARE * both)
     np.fill_diagonal(joined, False)
     return joined.astype(np.float32)
-
-
-def normalised(classes: Classes) -> np.ndarray:
-    """The graph between the known classes, ready for graph convolutions.
-
-    D^-1/2 (A + I) D^-1/2 with D the row sums of A + I (Kipf and Welling 2017), as in the published
-    code of MJOLNIR.
-
-    Returns:
-      [n, n] float32, symmetric, in the order of `classes.known`.
-    """
-    node = {cls: i for i, cls in enumerate(classes.known)}
-    weights = np.eye(len(node))
-    for i, j, weight in classes.edges:
-        weights[node[i], node[j]] = weights[node[j], node[i]] = weight
-    scale = 1 / np.sqrt(weights.sum(axis=1))
-    return (scale[:, None] * weights * scale).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What a network knows of the object classes when it is made: a run's `classes.json`."""
+"""The object classes that a network is made for: a run's `classes.json`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CLASSES_FILE = "classes.json"
 
 
 @dataclasses.dataclass(frozen=True)
-class Classes:
+class ClassVocabulary:
     """The vocabulary of a run.
 
     Attributes:
@@ -23,7 +23,7 @@ class Classes:
       known: indices of those that training may know; a model with a row per class has rows for
         these alone.
       edges: the class graph between known classes: (i, j, weight) with i < j, indices of `names`.
-        Self loops are understood. How it is found: `tdanet_jax.models.class_graph`.
+        Self loops are implied. `tdanet_jax.models.class_graph` builds it.
     """
 
     names: tuple[str, ...] = ()
@@ -34,10 +34,23 @@ class Classes:
         """Writes `classes.json` into a run's folder."""
         files.write_text(run / CLASSES_FILE, json.dumps(dataclasses.asdict(self)) + "\n")
 
+    def normalised_adjacency(self) -> np.ndarray:
+        """The class graph, ready for graph convolutions: [n, n] float32, in the order of `known`.
 
-def make_classes(
+        D^-1/2 (A + I) D^-1/2 with D the row sums of A + I (Kipf and Welling 2017), as in the
+        published code of MJOLNIR.
+        """
+        node = {cls: i for i, cls in enumerate(self.known)}
+        weights = np.eye(len(node))
+        for i, j, weight in self.edges:
+            weights[node[i], node[j]] = weights[node[j], node[i]] = weight
+        scale = 1 / np.sqrt(weights.sum(axis=1))
+        return (scale[:, None] * weights * scale).astype(np.float32)
+
+
+def make_vocabulary(
     names: tuple[str, ...], hidden: Collection[str], adjacency: np.ndarray | None = None
-) -> Classes:
+) -> ClassVocabulary:
     """The vocabulary of tables with these classes, of which `hidden` are kept from training.
 
     Args:
@@ -51,7 +64,7 @@ def make_classes(
     """
     known = tuple(i for i, name in enumerate(names) if name not in hidden)
     if adjacency is None:
-        return Classes(names, known)
+        return ClassVocabulary(names, known)
     if adjacency.shape != (len(names), len(names)):
         raise ValueError(f"class graph of shape {adjacency.shape}: must be a row per class")
     if not (np.isfinite(adjacency) & (adjacency >= 0)).all():
@@ -60,13 +73,13 @@ def make_classes(
     edges = tuple(
         (i, j, float(weights[i, j])) for i in known for j in known if i < j and weights[i, j]
     )
-    return Classes(names, known, edges)
+    return ClassVocabulary(names, known, edges)
 
 
-def load(run: Path) -> Classes:
+def load_vocabulary(run: Path) -> ClassVocabulary:
     """The vocabulary of a run; an empty one if it has no `classes.json`.
 
-    Runs written before there was that file hold a TDANet, which needs no vocabulary.
+    Runs from before the file existed hold a TDANet, which needs no vocabulary.
 
     Raises:
       ValueError: the file is unreadable; the message names it.
@@ -75,8 +88,8 @@ def load(run: Path) -> Classes:
     try:
         values = json.loads(path.read_text())
         edges = tuple((int(i), int(j), float(w)) for i, j, w in values.get("edges", ()))
-        return Classes(tuple(values["names"]), tuple(values["known"]), edges)
+        return ClassVocabulary(tuple(values["names"]), tuple(values["known"]), edges)
     except FileNotFoundError:
-        return Classes()
+        return ClassVocabulary()
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: not a vocabulary of this version: {error}") from None

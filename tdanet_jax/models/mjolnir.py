@@ -4,7 +4,7 @@ Every known class is a node. A node's input is the presence of all classes in th
 per class, and its own word vector; three graph convolutions turn it into five numbers, the node's
 context (present, x, y, S, cosine to the target) is appended, a fourth makes one number of the ten,
 and a linear layer maps those of all nodes to the features. The adjacency starts as the class graph
-(`tdanet_jax.models.class_graph`) and is trained, as in the published code.
+(`ClassVocabulary.edges`) and is trained, as in the published code.
 
 MJOLNIR-o appends the context itself. MJOLNIR-r instead appends the baseline's features of the
 image, which the previous action probabilities enter; its context enters through the graph alone.
@@ -15,7 +15,6 @@ presence, the sum of the first kernel's rows for the classes in the frame.
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import jax
@@ -26,7 +25,6 @@ from flax import struct
 
 from tdanet_jax.config import NetworkConfig
 from tdanet_jax.env.types import FEATURES, Observation
-from tdanet_jax.models import class_graph
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.encoder import Encoder
@@ -83,7 +81,7 @@ class GraphEncoder(nn.Module):
     dtype: Any = jnp.float32
 
     def setup(self) -> None:
-        start = functools.partial(class_graph.normalised, self.classes)
+        start = self.classes.normalised_adjacency
         self.adjacency = self.param("adjacency", lambda _: jnp.asarray(start()))
         self.kernels = [Kernel() for _ in range(3)]
         self.last = self.param("last", nonnegative_init, (NODE_UNITS + COLUMNS, 1))

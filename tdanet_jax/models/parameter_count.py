@@ -1,7 +1,7 @@
-"""How many parameters a model has: trained ones, and as its published code counts them.
+"""How many parameters a model has: those that are trained, and as its published code counts them.
 
-The tables of the papers count in units of 2^20, and count everything that their code registers as
-a parameter: frozen word vectors and layers that no result depends on, too.
+The tables of the papers count in units of 2^20, and include everything that their code registers as
+a parameter: also frozen word vectors and unused layers.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.classes import Classes
+from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.registry import make_model
 
 #: The unit of the papers' tables.
@@ -31,32 +31,30 @@ class Count:
 
     Attributes:
       trained: all that an optimiser changes.
-      beside: what the published code has more (less, if negative), by name.
+      extra: what the published code has in addition (fewer, if negative), by name.
     """
 
     trained: int
-    beside: Mapping[str, int]
+    extra: Mapping[str, int]
 
     @property
     def published(self) -> int:
-        """The count as the published code has it."""
-        return self.trained + sum(self.beside.values())
+        """The count of the published code."""
+        return self.trained + sum(self.extra.values())
 
 
 def count(model: ActorCritic, classes: int, width: int) -> Count:
-    """The parameters of a network for `classes` classes with word vectors of a `width`."""
+    """The parameters of a network for a number of classes with word vectors of a `width`."""
     words = jax.ShapeDtypeStruct((classes, width), jnp.float32)
     shapes = jax.eval_shape(model.initialise, jax.random.key(0), words)
     trained = sum(leaf.size for leaf in jax.tree.leaves(shapes))
-    lstm = shapes["lstm"]
-    inputs = lstm["kernel"].shape[0] - model.hidden
-    inputs += lstm["kernel_aside"].shape[0] if "kernel_aside" in lstm else 0
-    return Count(trained, model.encoder.published_beside(width, inputs))
+    rows = (w.shape[0] for name, w in shapes["lstm"].items() if name.startswith("kernel"))
+    return Count(trained, model.encoder.published_extra(width, sum(rows) - model.hidden))
 
 
 def as_published(name: str) -> Count:
     """The parameters of a named model at the published sizes: 300-d words, 101 or 97 classes."""
     number = SSNET_CLASSES if name == "ssnet" else PUBLISHED_CLASSES
     names = tuple(f"Class{i}" for i in range(number))
-    model = make_model(TrainConfig(model=name), Classes(names, tuple(range(number))))
+    model = make_model(TrainConfig(model=name), ClassVocabulary(names, tuple(range(number))))
     return count(model, number, PUBLISHED_WIDTH)

@@ -6,18 +6,11 @@ from typing import Any
 
 from tdanet_jax.config import NetworkConfig
 from tdanet_jax.models.baseline import BaselineEncoder
-from tdanet_jax.models.classes import Classes
-from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
+from tdanet_jax.models.classes import ClassVocabulary
+from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic, make_adaptive
 
 
-def make(config: NetworkConfig, classes: Classes, dtype: Any) -> AdaptiveActorCritic:
-    """SAVN. It multiplies in float32, whatever `dtype` says.
-
-    At some sizes XLA's CPU backend compiles its bfloat16 products and then refuses to run them.
-    """
-    return AdaptiveActorCritic(
-        BaselineEncoder(dropout=config.dropout, maps=config.image == "features"),
-        hidden=config.hidden,
-        rate=config.inner_rate,
-        first_order=config.first_order,
-    )
+def make(config: NetworkConfig, classes: ClassVocabulary, dtype: Any) -> AdaptiveActorCritic:
+    """SAVN, in float32 whatever `dtype` says."""
+    encoder = BaselineEncoder(dropout=config.dropout, maps=config.image == "features")
+    return make_adaptive(config, encoder)

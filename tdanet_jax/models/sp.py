@@ -18,7 +18,6 @@ from flax import struct
 
 from tdanet_jax.config import NetworkConfig
 from tdanet_jax.env.types import Observation
-from tdanet_jax.models import class_graph
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.layers import Linear, nonnegative_init
@@ -100,7 +99,7 @@ def make(
     """Scene priors, with `width` units in a node's hidden layers."""
     encoder = ScenePriorsEncoder(
         known=classes.known,
-        adjacency=tuple(map(tuple, class_graph.normalised(classes).tolist())),
+        adjacency=tuple(map(tuple, classes.normalised_adjacency().tolist())),
         features=config.width,
         width=width,
         dropout=config.dropout,

@@ -98,8 +98,8 @@ def forward(weights: Convolutions, shared: jax.Array, dtype: Any) -> jax.Array:
 def convolve(weights: Convolutions, shared: jax.Array, dtype: Any, value: jax.Array) -> jax.Array:
     """`forward(weights, shared, dtype)` with a known value; shared [B, h] or [T, B, h].
 
-    The backward pass goes through one step at a time and computes its layers again, so that only the
-    results are stored: the layers of a rollout would fill the memory.
+    The backward pass goes through one step at a time and computes its layers again, so that only
+    the results are stored: the layers of a rollout would fill the memory.
     """
     return value
 

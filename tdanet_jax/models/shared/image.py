@@ -106,7 +106,9 @@ class ImageTrunk(nn.Module):
             cells = self.convolution(obs.features)
         else:
             cell, mixed = class_table.cell, class_table.mixed
-            assert obs.cells is not None and cell is not None and mixed is not None
+            assert obs.cells is not None
+            assert cell is not None
+            assert mixed is not None
             # The table's row of each cell, [..., 49]; -1 is the last.
             index = obs.cells.reshape(*lead, CELLS) % len(class_table.words)
             if not drops and not self.convolution.adapted:
@@ -173,9 +175,7 @@ def _one_hot_look_up_fwd(table: jax.Array, index: jax.Array, dtype: Any) -> tupl
     return one_hot_look_up(table, index, dtype), (index, jnp.arange(table.shape[0]))
 
 
-def _one_hot_look_up_bwd(
-    dtype: Any, saved: tuple, cotangent: jax.Array
-) -> tuple[jax.Array, None]:
+def _one_hot_look_up_bwd(dtype: Any, saved: tuple, cotangent: jax.Array) -> tuple[jax.Array, None]:
     index, rows = saved
     width = cotangent.shape[-1]
 
