@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from tdanet_jax import poses
 from tdanet_jax import words as word_vectors
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.env import reward, zero_shot
+from tdanet_jax.env.environment import Environment
 from tdanet_jax.env.params import TEST_STEP_LIMITS, FeatureMaps, make_params
 from tdanet_jax.env.reward import Parents
 from tdanet_jax.env.types import EnvParams
@@ -83,6 +85,40 @@ class Task:
                 f"{run}: the model knows classes by their index in its training rooms, "
                 "and these rooms have others"
             )
+
+
+#: What the names of environments begin with.
+ITHOR = "ithor-"
+
+
+def make(
+    name: str = "ithor-18/4",
+    split: Literal["train", "test"] = "train",
+    config: TrainConfig | None = None,
+) -> tuple[Environment, EnvParams]:
+    """An environment by name, and its parameters, as `gymnax.make` gives them.
+
+    Args:
+      name: "ithor-" and the seen/unseen split, as of `TrainConfig.split`: "ithor-22/0",
+        "ithor-18/4", "ithor-14/8", or the unseen classes, "ithor-Mug,Vase,CD,Towel".
+      split: "train" has the training rooms and no trace of unseen classes; "test" begins episodes
+        in the test rooms, for seen and unseen targets, with the step limits of tests.
+      config: what else can be set: sensors, rows, step limit, rewards, rooms of your own. Its
+        `split` is replaced by the name's.
+
+    Raises:
+      ValueError: no environment has this name, or a file of the configuration is broken.
+    """
+    if not name.startswith(ITHOR):
+        raise ValueError(f"{name}: no such environment; try {ITHOR}18/4")
+    if split not in ("train", "test"):
+        raise ValueError(f"split {split!r}: must be 'train' or 'test'")
+    config = dataclasses.replace(config or TrainConfig(), split=name.removeprefix(ITHOR))
+    config.check()
+    task = load_task(config)
+    params = task.train_params if split == "train" else task.eval_params
+    words = task.train_words if split == "train" else task.words
+    return Environment(name, params, task.tables.classes, words), params
 
 
 def load_task(config: TrainConfig, progress: Progress | None = None) -> Task:

@@ -12,12 +12,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.splits import make_split
 from tdanet_jax.vocabulary import ROOM_TYPES
+
+if TYPE_CHECKING:
+    from tdanet_jax.scenes.tables import SceneTables
 
 #: Reward of any step that earns nothing else, a failed Done included.
 STEP_REWARD = -0.01

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tdanet_jax.scenes.tables import SceneTables
+if TYPE_CHECKING:
+    from tdanet_jax.scenes.tables import SceneTables
 
 
 def hide_classes(tables: SceneTables, hidden: Collection[str]) -> SceneTables:
