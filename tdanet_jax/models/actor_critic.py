@@ -211,14 +211,14 @@ def forward(
     prev_action_probs: jax.Array,
     is_first: jax.Array,
     dropout_mask: jax.Array | None = None,
-    tape: Any = None,
+    activations: Any = None,
 ) -> tuple[Any, Output]:
     """`ActorCritic.__call__` with these weights, for a step or a whole rollout.
 
     Args:
-      tape: what `act` has recorded in the same rollout; its products are taken from there.
+      activations: the activation cache that `act` filled in the same rollout.
     """
-    variables = {"params": weights} if tape is None else {"params": weights, ACTIVATIONS: tape}
+    cache = {} if activations is None else {ACTIVATIONS: activations}
     inputs = (class_table, carry, obs, prev_action_probs, is_first, dropout_mask)
-    out: Any = model.apply(variables, *inputs)
+    out: Any = model.apply({"params": weights, **cache}, *inputs)
     return out

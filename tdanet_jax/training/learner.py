@@ -52,7 +52,7 @@ class Rollout(NamedTuple):
     prev_action_probs: jax.Array
     is_first: jax.Array
     dropout_mask: jax.Array | None
-    tape: Any
+    activations: Any
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array
@@ -149,7 +149,7 @@ def rollout(
             prev_action_probs=state.recurrent.prev_action_probs,
             is_first=state.recurrent.is_first,
             dropout_mask=mask,
-            tape=kept.get(ACTIVATIONS, {}),
+            activations=kept.get(ACTIVATIONS, {}),
             action=action,
             log_prob=jnp.take_along_axis(log_probs, action[:, None], -1)[:, 0],
             value=out.value,
@@ -197,7 +197,9 @@ def loss(
     """
     class_table = actor_critic.prepare(model, weights, words)
     inputs = (steps.obs, steps.prev_action_probs, steps.is_first, steps.dropout_mask)
-    _, out = actor_critic.forward(model, weights, class_table, carry, *inputs, tape=steps.tape)
+    _, out = actor_critic.forward(
+        model, weights, class_table, carry, *inputs, activations=steps.activations
+    )
     counted = ~steps.bootstrap_only
     count = counted.sum()
 
