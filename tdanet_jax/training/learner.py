@@ -20,8 +20,8 @@ from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import EnvParams, EnvState, Observation
 from tdanet_jax.models import actor_critic
-from tdanet_jax.models.actor_critic import ActorCritic, RecurrentState
 from tdanet_jax.models.activation_cache import ACTIVATIONS
+from tdanet_jax.models.actor_critic import ActorCritic, RecurrentState
 from tdanet_jax.training.gae import advantages
 
 #: Kernels with more weights than this are cast to the network's precision once per rollout.
@@ -164,7 +164,7 @@ def rollout(
         following = state.replace(
             env_state=dynamics.choose(terminal, begun, moved.state),
             bootstrap_only=valued_next,
-            recurrent=recurrent.restarted(terminal),
+            recurrent=recurrent.replace(prev_action_probs=jnp.exp(log_probs)).restarted(terminal),
         )
         return following, step
 
