@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib
+import importlib.util
 import io
 import json
 import re
@@ -73,6 +73,12 @@ def test_files_that_a_page_names_exist(page: str) -> None:
     missing = [word for word in named if word.startswith(kept) and not (ROOT / word).exists()]
     tests = re.findall(r"pytest -m slow (\S+?)[\s`]", text(page))
     assert missing + [path for path in tests if not (ROOT / path).exists()] == []
+
+
+@pages()
+def test_modules_that_a_page_runs_exist(page: str) -> None:
+    for module in re.findall(r"python -m ([\w.]+)", text(page)):
+        assert importlib.util.find_spec(module) is not None, module
 
 
 @pages()
