@@ -138,7 +138,7 @@ def save_untrained(
     task = make_task(config, tables, vectors, features=features)
     task.classes.save(folder)
     if config.network.odometry:
-        weights = samples.going_by_odometry(task.model, task.words)
+        weights = samples.moving_by_odometry(task.model, task.words)
     else:
         weights = samples.parameters(task.model, task.words)
         weights["actor"]["bias"] = weights["actor"]["bias"].at[Action.DONE].set(-1.0)

@@ -8,11 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tdanet_jax.env.dynamics import FEATURES, RASTER, Observation
+from tdanet_jax.env.types import FEATURES, RASTER, Observation
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.sensors.odometry import Odometry
+from tdanet_jax.sensors.odometry import OdometryReading
 
 CLASSES, WIDTH, DETECTIONS = 9, 5, 6  # C, D, K
+
+
+def normal(*shape: int, seed: int = 0) -> jax.Array:
+    """Normally distributed numbers."""
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
 
 
 def words(seed: int = 0) -> np.ndarray:
@@ -51,15 +56,18 @@ def one_per_class(obs: Observation, seed: int = 3) -> Observation:
     )
 
 
-def odometry(*shape: int, seed: int = 4, sights: bool = False) -> Odometry:
-    """What agents might sense of their way, and of their target's place, in [*shape]."""
+def readings(*shape: int, seed: int = 4, triangulation: bool = False) -> dict[str, Any]:
+    """Random readings of the sensors in [*shape]: odometry, and perhaps triangulation."""
     rng = np.random.default_rng(seed)
     bits = rng.random((*shape, 9, 9, 9)) < 0.1
-    return Odometry(
+    odometry = OdometryReading(
         motion=jnp.asarray(rng.normal(size=(*shape, 12)), jnp.float32),
         window=jnp.asarray((bits << np.arange(9)).sum(-1), jnp.uint16),
-        target=jnp.asarray(rng.normal(size=(*shape, 9)), jnp.float32) if sights else None,
     )
+    if not triangulation:
+        return {"odometry": odometry}
+    target = jnp.asarray(rng.normal(size=(*shape, 9)), jnp.float32)
+    return {"odometry": odometry, "triangulation": target}
 
 
 def parameters(model: ActorCritic, words: Any, seed: int = 2) -> Any:
@@ -67,10 +75,10 @@ def parameters(model: ActorCritic, words: Any, seed: int = 2) -> Any:
     return randomised(jax.eval_shape(model.initialise, jax.random.key(0), words), seed)
 
 
-def going_by_odometry(model: ActorCritic, words: Any) -> Any:
-    """Random parameters of a network that senses its way, mostly moves ahead and rarely ends."""
+def moving_by_odometry(model: ActorCritic, words: Any) -> Any:
+    """Random parameters of a network with odometry that mostly moves ahead and rarely ends."""
     weights = parameters(model, words)
-    weights["way"]["kernel"] *= 5.0  # most of its inputs are zero
+    weights["sensor_embedding"]["kernel"] *= 5.0  # most of its inputs are zero
     weights["actor"]["bias"] = jnp.array([2.0, 0.0, 0.0, 0.0, 0.0, -1.0])
     return weights
 
