@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from tdanet_jax.env import dynamics
-from tdanet_jax.env.dynamics import EnvParams, EnvState, Observation
+from tdanet_jax.env.params import make_params
 from tdanet_jax.env.reward import Parents, cosines, greatest_similarity, no_parents
+from tdanet_jax.env.types import EnvParams, EnvState, Observation
+from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.scenes.tables import build
 from tdanet_jax.vocabulary import TARGETS, Action
@@ -170,7 +172,7 @@ def assert_worlds_agree(world: World, params: EnvParams, batch: int, steps: int,
 def test_agrees_with_the_slow_world_on_10000_steps_in_real_rooms(some_rooms: SceneTables) -> None:
     parents, named = random_parents(some_rooms, seed=1)
     world = World(some_rooms, named, STEP_LIMITS, oracle.walk_on_grid(some_rooms))
-    params = dynamics.make_params(some_rooms, TARGETS, parents, STEP_LIMITS, merge=False)
+    params = make_params(some_rooms, TARGETS, parents, STEP_LIMITS, ObservationSpec())
     successes = assert_worlds_agree(world, params, batch=100, steps=100, seed=2)
     assert successes > 100, "the walk should reach targets, or little has been compared"
 
@@ -181,7 +183,7 @@ def test_agrees_with_the_slow_world_in_rooms_built_from_boxes() -> None:
     tables = build([toy.corridor(), *rooms], targets=("Apple", "Mug", "Sofa"))
     parents, named = random_parents(tables, seed=1)
     world = World(tables, named, STEP_LIMITS, oracle.walk_on_grid(tables))
-    params = dynamics.make_params(tables, in_use(tables), parents, STEP_LIMITS, merge=False)
+    params = make_params(tables, in_use(tables), parents, STEP_LIMITS, ObservationSpec())
     assert assert_worlds_agree(world, params, batch=20, steps=40, seed=3) > 20
 
 
@@ -203,8 +205,9 @@ def random_likeness(
 def test_rewards_for_likeness_agree_with_the_slow_world(some_rooms: SceneTables) -> None:
     similarity, named = random_likeness(some_rooms, seed=5)
     world = World(some_rooms, {}, STEP_LIMITS, similarity=named)
-    params = dynamics.make_params(
-        some_rooms, TARGETS, no_parents(some_rooms), STEP_LIMITS, False, similarity=similarity
+    nobody = no_parents(some_rooms)
+    params = make_params(
+        some_rooms, TARGETS, nobody, STEP_LIMITS, ObservationSpec(), similarity=similarity
     )
     assert assert_worlds_agree(world, params, batch=25, steps=30, seed=6) > 20
 
@@ -215,8 +218,8 @@ def test_rewards_for_likeness_agree_on_random_tables(tables: SceneTables, seed: 
     similarity, named = random_likeness(tables, seed)
     world = World(tables, {}, STEP_LIMITS, similarity=named)
     nobody = no_parents(tables)
-    params = dynamics.make_params(
-        tables, in_use(tables), nobody, STEP_LIMITS, False, similarity=similarity
+    params = make_params(
+        tables, in_use(tables), nobody, STEP_LIMITS, ObservationSpec(), similarity=similarity
     )
     assert_worlds_agree(world, params, batch=8, steps=20, seed=seed)
 
@@ -224,7 +227,7 @@ def test_rewards_for_likeness_agree_on_random_tables(tables: SceneTables, seed: 
 def check_random_tables(tables: SceneTables, seed: int) -> None:
     parents, named = random_parents(tables, seed)
     world = World(tables, named, STEP_LIMITS)
-    params = dynamics.make_params(tables, in_use(tables), parents, STEP_LIMITS, merge=False)
+    params = make_params(tables, in_use(tables), parents, STEP_LIMITS, ObservationSpec())
     assert_worlds_agree(world, params, batch=8, steps=20, seed=seed)
 
 
@@ -241,48 +244,44 @@ def test_agrees_with_the_slow_world_on_many_random_tables(tables: SceneTables, s
     check_random_tables(tables, seed)
 
 
-def check_observations(tables: SceneTables, merge: bool, states: np.ndarray) -> None:
+def check_observations(tables: SceneTables, rows: Any, states: np.ndarray) -> None:
     world = World(tables, {}, STEP_LIMITS)
-    params = dynamics.make_params(tables, in_use(tables), no_parents(tables), STEP_LIMITS, merge)
+    params = params_of(tables, rows)
     zeros = jnp.zeros(len(states), jnp.int32)
     seen = EnvState(jnp.asarray(states), zeros, zeros, zeros, zeros)
     obs = jax.device_get(observe(seen, params))
     for row, pose in enumerate(states):
-        expected = world.detections(int(pose), merge)
+        expected = world.detections(int(pose), merge=rows == "class")
         assert_same_detections(detections_of(obs, row, tables), expected)
 
 
-@pytest.mark.parametrize("merge", [False, True])
-def test_observations_of_real_rooms_are_the_slow_worlds(
-    some_rooms: SceneTables, merge: bool
-) -> None:
+@pytest.mark.parametrize("rows", ["object", "class"])
+def test_observations_of_real_rooms_are_the_slow_worlds(some_rooms: SceneTables, rows: str) -> None:
     states = np.random.default_rng(3).choice(some_rooms.num_states, 400, replace=False)
-    check_observations(some_rooms, merge, states.astype(np.int32))
+    check_observations(some_rooms, rows, states.astype(np.int32))
 
 
 @settings(max_examples=10)
-@given(random_tables(), st.booleans())
-def test_observations_of_random_tables_are_the_slow_worlds(
-    tables: SceneTables, merge: bool
-) -> None:
-    check_observations(tables, merge, np.arange(tables.num_states, dtype=np.int32))
+@given(random_tables(), st.sampled_from(["object", "class"]))
+def test_observations_of_random_tables_are_the_slow_worlds(tables: SceneTables, rows: str) -> None:
+    check_observations(tables, rows, np.arange(tables.num_states, dtype=np.int32))
 
 
 def test_the_last_rows_of_the_table_are_observed_whole(some_rooms: SceneTables) -> None:
     # A window of K rows that starts at the last pose must not be moved back by clamping.
     states = np.arange(some_rooms.num_states - 32, some_rooms.num_states, dtype=np.int32)
-    check_observations(some_rooms, False, states)
+    check_observations(some_rooms, "object", states)
 
 
-@pytest.mark.parametrize("merge", [False, True])
-def test_no_detection_is_dropped_for_lack_of_room(some_rooms: SceneTables, merge: bool) -> None:
-    params = dynamics.make_params(some_rooms, TARGETS, no_parents(some_rooms), STEP_LIMITS, merge)
+@pytest.mark.parametrize("rows", ["object", "class"])
+def test_no_detection_is_dropped_for_lack_of_room(some_rooms: SceneTables, rows: str) -> None:
+    params = params_of(some_rooms, rows)
     fullest = np.diff(params.row_start).argmax().astype(np.int32)
     zero = jnp.int32(0)
     obs = dynamics.observe(EnvState(jnp.int32(fullest), zero, zero, zero, zero), params)
     assert obs.mask.all()
     world = World(some_rooms, {}, STEP_LIMITS)
-    assert len(obs.mask) == len(world.detections(int(fullest), merge))
+    assert len(obs.mask) == len(world.detections(int(fullest), merge=rows == "class"))
 
 
 def two_mugs(kind: str = "kitchen") -> SceneTables:
@@ -300,8 +299,9 @@ def two_mugs(kind: str = "kitchen") -> SceneTables:
     return tables_of([room], ["Bread", "Mug"], ["Mug", "Bread"])
 
 
-def params_of(tables: SceneTables, merge: bool = False) -> EnvParams:
-    return dynamics.make_params(tables, in_use(tables), no_parents(tables), STEP_LIMITS, merge)
+def params_of(tables: SceneTables, rows: Any = "object") -> EnvParams:
+    spec = ObservationSpec(rows)
+    return make_params(tables, in_use(tables), no_parents(tables), STEP_LIMITS, spec)
 
 
 def at(pose: int, target: int = 0) -> EnvState:
@@ -319,7 +319,7 @@ def test_a_detection_is_the_centre_and_area_of_its_box() -> None:
 
 def test_a_merged_detection_has_the_mean_corner_and_the_common_extent() -> None:
     tables = two_mugs()
-    obs = dynamics.observe(at(handmade.state(2, 0)), params_of(tables, merge=True))
+    obs = dynamics.observe(at(handmade.state(2, 0)), params_of(tables, "class"))
     mug = np.asarray(obs.boxes[1])
     assert tables.classes[int(obs.classes[1])] == "Mug"
     assert int(obs.mask.sum()) == 2
@@ -337,9 +337,9 @@ def test_a_class_in_view_beyond_reach_is_not_visible() -> None:
     tables = two_mugs()
     params = params_of(tables)
     bread = jnp.int32(tables.classes.index("Bread"))
-    assert bool(dynamics.is_visible(params, jnp.int32(handmade.state(2, 0)), bread))
-    assert not bool(dynamics.is_visible(params, jnp.int32(handmade.state(2, 45)), bread))
-    assert not bool(dynamics.is_visible(params, jnp.int32(handmade.state(2, 0)), jnp.int32(-1)))
+    assert bool(dynamics.is_visible(jnp.int32(handmade.state(2, 0)), bread, params))
+    assert not bool(dynamics.is_visible(jnp.int32(handmade.state(2, 45)), bread, params))
+    assert not bool(dynamics.is_visible(jnp.int32(handmade.state(2, 0)), jnp.int32(-1), params))
 
 
 @pytest.mark.parametrize(
@@ -363,7 +363,7 @@ def test_a_class_in_view_beyond_reach_is_not_visible() -> None:
 def test_actions_move_as_described_and_impossible_ones_do_not(
     pose: oracle.Pose, action: int, expected: oracle.Pose
 ) -> None:
-    moved = dynamics.move(params_of(two_mugs()), jnp.int32(state_of(pose)), jnp.int32(action))
+    moved = dynamics.move(jnp.int32(state_of(pose)), jnp.int32(action), params_of(two_mugs()))
     assert pose_of(int(moved)) == expected
 
 
@@ -394,7 +394,7 @@ def test_the_step_limit_of_the_room_type_truncates_and_does_not_terminate(
 def contract(some_rooms: SceneTables) -> tuple[EnvParams, EnvState, jax.Array, jax.Array]:
     """Parameters, a batch of states in mid-episode, actions and keys."""
     parents, _ = random_parents(some_rooms, seed=4)
-    params = dynamics.make_params(some_rooms, TARGETS, parents, STEP_LIMITS, merge=True)
+    params = make_params(some_rooms, TARGETS, parents, STEP_LIMITS, ObservationSpec("class"))
     keys = jax.random.split(jax.random.key(5), 24)
     _, state = reset(keys, params)
     state = state.replace(steps=jnp.arange(24, dtype=jnp.int32) % 5)
@@ -430,7 +430,7 @@ def test_a_plain_number_is_an_action_too(action: int) -> None:
 
 def test_one_trace_per_shape_whatever_the_tables_hold(some_rooms: SceneTables) -> None:
     parents, _ = random_parents(some_rooms, seed=4)
-    params = dynamics.make_params(some_rooms, TARGETS, parents, STEP_LIMITS, merge=True)
+    params = make_params(some_rooms, TARGETS, parents, STEP_LIMITS, ObservationSpec("class"))
     others = jax.tree.map(lambda x: x + 0, params).replace(
         step_limit=jnp.asarray((3, 3, 3, 3), jnp.int32)
     )
@@ -449,11 +449,11 @@ def test_one_trace_per_shape_whatever_the_tables_hold(some_rooms: SceneTables) -
 
 def test_dtypes_are_stable_from_reset_through_steps(contract: tuple) -> None:
     params, state, actions, keys = contract
-    obs, fresh = jax.eval_shape(jax.vmap(dynamics.reset, (0, None)), keys, params)
+    obs, begun = jax.eval_shape(jax.vmap(dynamics.reset, (0, None)), keys, params)
     after = jax.eval_shape(jax.vmap(dynamics.step, (0, 0, 0, None)), keys, state, actions, params)
     chex.assert_trees_all_equal_shapes_and_dtypes(after[0], obs)
-    chex.assert_trees_all_equal_shapes_and_dtypes(after[1], fresh)
-    chex.assert_trees_all_equal_shapes_and_dtypes(after[5]["final_state"], fresh)
+    chex.assert_trees_all_equal_shapes_and_dtypes(after[1], begun)
+    chex.assert_trees_all_equal_shapes_and_dtypes(after[5]["final_state"], begun)
     assert after[2].dtype == jnp.float32
     assert [after[i].dtype for i in (3, 4)] == [jnp.bool_] * 2
     chex.assert_trees_all_equal_shapes_and_dtypes(
@@ -493,9 +493,9 @@ def assert_uniform(values: np.ndarray, expected: set[int]) -> None:
 
 def test_resets_are_uniform_over_room_types_then_scenes_then_targets_then_starts() -> None:
     tables = lopsided()
-    params = dynamics.make_params(
+    params = make_params(
         tables, {"kitchen": ("Mug", "Bread"), "bedroom": ("Bread",)}, no_parents(tables),
-        STEP_LIMITS, merge=False,
+        STEP_LIMITS, ObservationSpec(),
     )  # fmt: skip
     keys = jax.random.split(jax.random.key(8), 20_000)
     state = jax.device_get(jax.jit(jax.vmap(dynamics.reset_state, (0, None)))(keys, params))

@@ -11,8 +11,10 @@ import pytest
 
 from tdanet_jax.config import LearnerConfig, TrainConfig
 from tdanet_jax.env import dynamics, reward
-from tdanet_jax.env.dynamics import EnvState
+from tdanet_jax.env.params import make_params
 from tdanet_jax.env.reward import Parents, find_parents
+from tdanet_jax.env.types import EnvParams, EnvState
+from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.splits import make_split
 from tdanet_jax.task import make_task
@@ -134,7 +136,7 @@ SCENERY: tuple[tuple[str, ...], ...] = (
 
 
 @pytest.fixture(scope="module")
-def params() -> dynamics.EnvParams:
+def params() -> EnvParams:
     """The corridor, with two parents; everything is in view everywhere, near only as listed."""
     objects = [(name, (0.0, 0.0, 0.0)) for name in (TARGET, LARGE, SMALL)]
     sightings = {
@@ -150,10 +152,10 @@ def params() -> dynamics.EnvParams:
     classes = [[CLASSES.index(SMALL), CLASSES.index(LARGE), -1]]
     worth = [[WORTH[SMALL], WORTH[LARGE], 0.0]]
     parents = Parents(np.array(classes, np.int32), np.array(worth, np.float32))
-    return dynamics.make_params(tables, {"kitchen": [TARGET]}, parents, (50,) * 4, merge=False)
+    return make_params(tables, {"kitchen": [TARGET]}, parents, (50,) * 4, ObservationSpec())
 
 
-def rewards(params: dynamics.EnvParams, state: EnvState, actions: str) -> list[float]:
+def rewards(params: EnvParams, state: EnvState, actions: str) -> list[float]:
     """Rewards along a walk: m moves ahead, l and r turn, d says Done."""
     found = []
     for letter in actions:
@@ -165,9 +167,9 @@ def rewards(params: dynamics.EnvParams, state: EnvState, actions: str) -> list[f
     return found
 
 
-def standing(params: dynamics.EnvParams, place: int, heading: int = 0) -> EnvState:
+def standing(params: EnvParams, place: int, heading: int = 0) -> EnvState:
     """An episode of the first target that starts in the corridor."""
-    return dynamics.start(params, jnp.int32(handmade.state(place, heading)), jnp.int32(0))
+    return dynamics.start(jnp.int32(handmade.state(place, heading)), jnp.int32(0), params)
 
 
 STEP = pytest.approx(-0.01)
@@ -195,12 +197,12 @@ STEP = pytest.approx(-0.01)
     ],
 )
 def test_each_step_earns_one_of_four_values(
-    params: dynamics.EnvParams, start: int, actions: str, expected: list[float]
+    params: EnvParams, start: int, actions: str, expected: list[float]
 ) -> None:
     assert rewards(params, standing(params, start), actions) == pytest.approx(expected)
 
 
-def test_what_is_in_view_but_beyond_reach_earns_nothing(params: dynamics.EnvParams) -> None:
+def test_what_is_in_view_but_beyond_reach_earns_nothing(params: EnvParams) -> None:
     # Turned by 90 degrees everything is in view and nothing is near.
     assert rewards(params, standing(params, 7, 90), "d") == [STEP]
     assert rewards(params, standing(params, 7, 45), "r") == [STEP]
@@ -216,7 +218,9 @@ def test_a_parents_reward_is_the_one_of_its_own_target() -> None:
         np.array([[sink, -1, -1], [-1, sink, -1]], np.int32),
         np.array([[0.3, 0, 0], [0, 0.1, 0]], np.float32),
     )
-    params = dynamics.make_params(tables, {"kitchen": ["Apple", "Mug"]}, parents, (50,) * 4, False)
+    params = make_params(
+        tables, {"kitchen": ["Apple", "Mug"]}, parents, (50,) * 4, ObservationSpec()
+    )
     zero = jnp.int32(0)
     for goal, worth in ((0, 0.3), (1, 0.1)):
         state = EnvState(jnp.int32(handmade.state(0, 45)), jnp.int32(goal), zero, zero, zero)
@@ -265,8 +269,8 @@ def test_likeness_pays_when_it_is_the_largest_so_far(
         cosine[CLASSES.index("Mug"), CLASSES.index(name)] = value
     similarity = reward.greatest_similarity(tables, cosine)
     nobody = reward.no_parents(tables)
-    params = dynamics.make_params(
-        tables, {"kitchen": ["Mug"]}, nobody, (50,) * 4, False, similarity=similarity
+    params = make_params(
+        tables, {"kitchen": ["Mug"]}, nobody, (50,) * 4, ObservationSpec(), similarity=similarity
     )
     assert rewards(params, standing(params, start), actions) == pytest.approx(expected)
 

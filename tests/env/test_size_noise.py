@@ -10,8 +10,10 @@ import pytest
 
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.env import dynamics
-from tdanet_jax.env.dynamics import EnvParams, EnvState, Observation
+from tdanet_jax.env.params import make_params
 from tdanet_jax.env.reward import no_parents
+from tdanet_jax.env.types import EnvParams, EnvState, Observation
+from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.task import make_task
@@ -23,8 +25,8 @@ BATCH, STEPS, NOISE = 128, 40, 0.5
 
 def params_of(tables: SceneTables, noise: float, senses: bool = False) -> EnvParams:
     targets = dict.fromkeys(ROOMS, tables.targets)
-    more = {"odometry": senses, "triangulation": senses, "size_noise": noise}
-    return dynamics.make_params(tables, targets, no_parents(tables), (7,) * 4, merge=False, **more)
+    spec = ObservationSpec(sensors=("odometry", "triangulation") if senses else ())
+    return make_params(tables, targets, no_parents(tables), (7,) * 4, spec, size_noise=noise)
 
 
 @jax.jit
@@ -76,9 +78,7 @@ def test_what_is_sensed_of_the_target_is_that_of_its_changed_boxes(some_rooms: S
     (_, truth), (state, obs) = (
         played(params_of(some_rooms, noise, True)) for noise in (0.0, NOISE)
     )
-    assert truth.odometry is not None
-    assert obs.odometry is not None
-    there, seen = np.asarray(truth.odometry.target), np.asarray(obs.odometry.target)
+    there, seen = (np.asarray(found.sensors["triangulation"]) for found in (truth, obs))
     place, radius = slice(0, 3), 3
     np.testing.assert_array_equal(seen[..., place], there[..., place])
     whole = (there[..., radius] < 0.6) & (seen[..., radius] < 0.6) & (there[..., radius] > 0)
@@ -90,7 +90,7 @@ def test_no_box_exceeds_the_image(some_rooms: SceneTables) -> None:
     params = params_of(some_rooms, NOISE)
     row = int(np.flatnonzero(some_rooms.row_class == int(params.target_class[0]))[0])
     pose = jnp.int32(some_rooms.row_state[row])
-    huge = dynamics.start(params, pose, jnp.int32(0), jnp.float32(1e9))
+    huge = dynamics.start(pose, jnp.int32(0), params, jnp.float32(1e9))
     obs = jax.jit(dynamics.observe)(huge, params)
     of_target = np.asarray(obs.boxes[:, 2])[np.asarray(obs.mask & (obs.classes == obs.target))]
     assert of_target.size
@@ -99,7 +99,7 @@ def test_no_box_exceeds_the_image(some_rooms: SceneTables) -> None:
 
 def test_without_noise_nothing_is_drawn(some_rooms: SceneTables) -> None:
     assert dynamics.reset_state(jax.random.key(0), params_of(some_rooms, 0.0)).area_factor is None
-    start = jax.jit(dynamics.start)(params_of(some_rooms, NOISE), jnp.int32(0), jnp.int32(0))
+    start = jax.jit(dynamics.start)(jnp.int32(0), jnp.int32(0), params_of(some_rooms, NOISE))
     assert start.area_factor is None  # a given episode is as it is
 
 

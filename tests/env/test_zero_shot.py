@@ -18,6 +18,7 @@ import pytest
 
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.env import dynamics, zero_shot
+from tdanet_jax.env.types import EnvParams, EnvState
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.splits import Split, make_split
 from tdanet_jax.task import make_task
@@ -153,10 +154,10 @@ def assert_identical(first: Any, second: Any) -> None:
 
 
 @jax.jit
-def training_walk(params: dynamics.EnvParams) -> tuple[Any, ...]:
+def training_walk(params: EnvParams) -> tuple[Any, ...]:
     """All that 32 agents see and earn on a random walk of 60 steps through training episodes."""
 
-    def body(state: dynamics.EnvState, key: jax.Array) -> tuple[dynamics.EnvState, tuple[Any, ...]]:
+    def body(state: EnvState, key: jax.Array) -> tuple[EnvState, tuple[Any, ...]]:
         keys = jax.random.split(key, 33)
         actions = jax.random.randint(keys[32], (32,), 0, 6)
         out = jax.vmap(dynamics.step, (0, 0, 0, None))(keys[:32], state, actions, params)
