@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tdanet_jax.env.dynamics import Observation
+from tdanet_jax.env.types import Observation
+from tdanet_jax.models.activation_cache import ACTIVATIONS
 from tdanet_jax.models.actor_critic import ActorCritic, Output
-from tdanet_jax.models.layers import TAPE, Carry
+from tdanet_jax.models.lstm import Carry
 from tdanet_jax.models.tdanet import TDANetEncoder
 from tests.support import equations, samples
 from tests.support.samples import observations
@@ -33,26 +34,32 @@ def parameters() -> Any:
 
 
 def inputs(seed: int = 0) -> tuple[Carry, Observation, jax.Array, jax.Array, jax.Array]:
-    """Carry, observations, previous probabilities, episode starts and dropout of a rollout."""
+    """A rollout's carry, observations, previous action probabilities, starts and dropout mask."""
     rng = np.random.default_rng(seed)
-    fresh = rng.random((T, B)) < 0.3
-    previous = np.where(fresh[..., None], 0, rng.dirichlet(np.ones(6), (T, B)))
+    is_first = rng.random((T, B)) < 0.3
+    prev_action_probs = np.where(is_first[..., None], 0, rng.dirichlet(np.ones(6), (T, B)))
     carry = tuple(jnp.asarray(rng.normal(size=(B, H)), jnp.float32) for _ in range(2))
-    keep = jnp.asarray(rng.random((T, B, 7)) < 0.75)
+    dropout_mask = jnp.asarray(rng.random((T, B, 7)) < 0.75)
     obs = observations(T, B, seed=seed)
-    return carry, obs, jnp.asarray(previous, jnp.float32), jnp.asarray(fresh), keep
+    return (
+        carry,
+        obs,
+        jnp.asarray(prev_action_probs, jnp.float32),
+        jnp.asarray(is_first),
+        dropout_mask,
+    )
 
 
 @jax.jit
 def forward(params: Any, carry: Carry, obs: Observation, *rest: Any) -> tuple[Carry, Output]:
     module = network()
-    table = module.apply({"params": params}, WORDS, method="prepare")
-    return module.apply({"params": params}, table, carry, obs, *rest)
+    class_table = module.apply({"params": params}, WORDS, method="prepare")
+    return module.apply({"params": params}, class_table, carry, obs, *rest)
 
 
 def plain(xp: Any, params: Any, given: Any) -> tuple[Any, Any]:
     """The printed equations on inputs that are NumPy arrays."""
-    carry, obs, previous, fresh, keep = given
+    carry, obs, prev_action_probs, is_first, dropout_mask = given
     frames = [
         [
             (xp.asarray(rows), xp.asarray(word))
@@ -60,15 +67,15 @@ def plain(xp: Any, params: Any, given: Any) -> tuple[Any, Any]:
         ]
         for row in (jax.tree.map(lambda x, t=t: x[t], obs) for t in range(T))
     ]
-    arrays = [xp.asarray(x) for x in (previous, *carry, fresh, keep)]
+    arrays = [xp.asarray(x) for x in (prev_action_probs, *carry, is_first, dropout_mask)]
     return equations.actor_critic(
         xp, params, frames, arrays[0], (arrays[1], arrays[2]), arrays[3], ~arrays[4]
     )
 
 
 def test_logits_and_values_are_those_of_the_printed_equations() -> None:
-    carry, obs, previous, fresh, keep = inputs()
-    _, out = forward(parameters(), carry, obs, previous, fresh, keep)
+    carry, obs, prev_action_probs, is_first, dropout_mask = inputs()
+    _, out = forward(parameters(), carry, obs, prev_action_probs, is_first, dropout_mask)
     logits, value = plain(np, equations.in_float64(parameters()), jax.device_get(inputs()))
     assert out.logits.shape == (T, B, 6)
     assert out.value.shape == (T, B)
@@ -76,17 +83,23 @@ def test_logits_and_values_are_those_of_the_printed_equations() -> None:
     np.testing.assert_allclose(out.value, value, **CLOSE)
 
 
-def test_the_gradient_with_a_tape_is_that_of_the_printed_equations() -> None:
-    carry, obs, previous, fresh, keep = inputs()
+def test_the_gradient_with_a_cache_is_that_of_the_printed_equations() -> None:
+    carry, obs, prev_action_probs, is_first, dropout_mask = inputs()
     module, params = network(), parameters()
     rng = np.random.default_rng(1)
     mix = jnp.asarray(rng.normal(size=(T, B, 6)), jnp.float32)
-    tape = record(params, carry, obs, previous, fresh, keep)[1]
+    cache = act_alone(params, carry, obs, prev_action_probs, is_first, dropout_mask)[1]
 
     def fast(params: Any) -> jax.Array:
-        table = module.apply({"params": params}, WORDS, method="prepare")
+        class_table = module.apply({"params": params}, WORDS, method="prepare")
         _, out = module.apply(
-            {"params": params, TAPE: tape}, table, carry, obs, previous, fresh, keep
+            {"params": params, ACTIVATIONS: cache},
+            class_table,
+            carry,
+            obs,
+            prev_action_probs,
+            is_first,
+            dropout_mask,
         )
         return (out.logits * mix).sum() + (out.value * mix[..., 0]).sum()
 
@@ -101,47 +114,58 @@ def test_the_gradient_with_a_tape_is_that_of_the_printed_equations() -> None:
     )
 
 
-def record(
-    params: Any, carry: Carry, obs: Observation, previous: jax.Array, fresh: jax.Array, keep: Any
+def act_alone(
+    params: Any,
+    carry: Carry,
+    obs: Observation,
+    prev_action_probs: jax.Array,
+    is_first: jax.Array,
+    dropout_mask: Any,
 ) -> tuple[Output, Any]:
-    """The outputs of T single steps and their tape."""
+    """The outputs of T single steps and their activation cache."""
     module = network()
-    table = module.apply({"params": params}, WORDS, method="prepare")
+    class_table = module.apply({"params": params}, WORDS, method="prepare")
 
     def act(carry: Carry, step: Any) -> Any:
-        (carry, out), tape = module.apply({"params": params}, table, carry, *step, mutable=[TAPE])
-        return carry, (out, tape[TAPE])
+        (carry, out), cache = module.apply(
+            {"params": params}, class_table, carry, *step, mutable=[ACTIVATIONS]
+        )
+        return carry, (out, cache[ACTIVATIONS])
 
-    return jax.lax.scan(act, carry, (obs, previous, fresh, keep))[1]
+    return jax.lax.scan(act, carry, (obs, prev_action_probs, is_first, dropout_mask))[1]
 
 
 def test_a_rollout_equals_its_steps() -> None:
     carry, *rest = inputs()
-    stepped, _ = record(parameters(), carry, *rest)
+    stepped, _ = act_alone(parameters(), carry, *rest)
     chex.assert_trees_all_close(forward(parameters(), carry, *rest)[1], stepped, **CLOSE)
 
 
-def test_a_fresh_episode_knows_nothing_of_the_carry() -> None:
-    carry, obs, previous, _, keep = inputs()
-    row = jax.tree.map(lambda x: x[0], (obs, previous))
-    fresh = jnp.ones(B, bool)
+def test_the_first_step_knows_nothing_of_the_carry() -> None:
+    carry, obs, prev_action_probs, _, dropout_mask = inputs()
+    row = jax.tree.map(lambda x: x[0], (obs, prev_action_probs))
+    is_first = jnp.ones(B, bool)
     zero = network().initial_carry(B, parameters())
     chex.assert_trees_all_equal(
-        forward(parameters(), carry, *row, fresh, keep[0]),
-        forward(parameters(), zero, *row, fresh, keep[0]),
+        forward(parameters(), carry, *row, is_first, dropout_mask[0]),
+        forward(parameters(), zero, *row, is_first, dropout_mask[0]),
     )
     assert not jnp.concatenate(zero).any()
 
 
-@pytest.mark.parametrize("part", ["carry", "previous"])
+@pytest.mark.parametrize("part", ["carry", "action"])
 def test_the_past_matters(part: str) -> None:
-    carry, obs, previous, _, keep = inputs()
-    obs, previous, keep = jax.tree.map(lambda x: x[0], (obs, previous, keep))
+    carry, obs, prev_action_probs, _, dropout_mask = inputs()
+    obs, prev_action_probs, dropout_mask = jax.tree.map(
+        lambda x: x[0], (obs, prev_action_probs, dropout_mask)
+    )
     stale = jnp.zeros(B, bool)
     other_carry = jax.tree.map(lambda x: x + 1, carry) if part == "carry" else carry
-    other_previous = jnp.roll(previous + 0.1, 1, axis=-1) if part == "previous" else previous
-    first = forward(parameters(), carry, obs, previous, stale, keep)[1]
-    second = forward(parameters(), other_carry, obs, other_previous, stale, keep)[1]
+    other_probs = (
+        jnp.roll(prev_action_probs + 0.1, 1, axis=-1) if part == "action" else prev_action_probs
+    )
+    first = forward(parameters(), carry, obs, prev_action_probs, stale, dropout_mask)[1]
+    second = forward(parameters(), other_carry, obs, other_probs, stale, dropout_mask)[1]
     assert not np.allclose(first.logits, second.logits)
 
 
@@ -189,8 +213,8 @@ def test_a_bfloat16_network_is_close() -> None:
     half = ActorCritic(
         TDANetEncoder(7, dtype=jnp.bfloat16), hidden=H, action_width=4, dtype=jnp.bfloat16
     )
-    table = half.apply({"params": parameters()}, WORDS, method="prepare")
-    _, out = jax.jit(half.apply)({"params": parameters()}, table, carry, *rest)
+    class_table = half.apply({"params": parameters()}, WORDS, method="prepare")
+    _, out = jax.jit(half.apply)({"params": parameters()}, class_table, carry, *rest)
     _, full = forward(parameters(), carry, *rest)
     for one, two in ((out.logits, full.logits), (out.value, full.value)):
         assert one.dtype == jnp.float32

@@ -1,4 +1,4 @@
-"""The class graph: its rule by hand, against a slow form in the real rooms, and its normal form."""
+"""The class graph: its rule by hand, and against a slow form in the real rooms."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import pytest
 
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.models import class_graph
-from tdanet_jax.models.classes import Classes
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.scenes.dataset import Extras
 from tdanet_jax.task import make_task
@@ -42,7 +41,7 @@ def test_two_classes_are_joined_if_half_of_two_rooms_show_them_near() -> None:
             {"Apple": 0.0, "Sink": 5.0},
         )
     )
-    # Apple and Sink are near in one of three rooms, Sofa shares one room alone with the others.
+    # Apple and Sink are near in one of three rooms, Sofa shares only one room with the others.
     # Mug and Sink: 1.0 m in the first room, 3.49 in the second.
     assert joined(found) == {("Apple", "Mug"), ("Mug", "Sink")}
     np.testing.assert_array_equal(found, found.T)
@@ -70,19 +69,7 @@ def test_the_training_rooms_graph_is_the_one_of_a_slow_form(
             assert found[i, j] == (len(gaps) >= 2 and near >= len(gaps) / 2)
 
 
-def test_the_normal_form_is_symmetric_with_self_loops() -> None:
-    classes = Classes(CLASSES, (0, 2, 3), ((0, 2, 1.0), (2, 3, 0.5)))
-    found = class_graph.normalised(classes)
-    degree = np.array([2.0, 2.5, 1.5])
-    expected = np.array([[1, 1, 0], [1, 1, 0.5], [0, 0.5, 1]]) / np.sqrt(np.outer(degree, degree))
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
-
-
-def test_without_edges_every_class_is_its_own() -> None:
-    np.testing.assert_array_equal(class_graph.normalised(Classes(CLASSES, (1, 4))), np.eye(2))
-
-
-def test_a_graph_from_elsewhere_takes_the_place_of_the_rooms_own(
+def test_an_imported_graph_replaces_that_of_the_rooms(
     ithor: SceneTables, glove: WordVectors
 ) -> None:
     names = ithor.classes
@@ -93,13 +80,13 @@ def test_a_graph_from_elsewhere_takes_the_place_of_the_rooms_own(
         TrainConfig(split="18/4"), ithor, glove, Extras(graph_classes=names, adjacency=adjacency)
     )
     assert task.classes.edges == ((mug, sink, 1.0),)  # Toaster is unseen
-    own = make_task(TrainConfig(split="18/4"), ithor, glove).classes
-    assert 400 < len(own.edges) < 900
-    assert {i for edge in own.edges for i in edge[:2]} <= set(own.known)
+    built = make_task(TrainConfig(split="18/4"), ithor, glove).classes
+    assert 400 < len(built.edges) < 900
+    assert {i for edge in built.edges for i in edge[:2]} <= set(built.known)
 
 
 @pytest.mark.parametrize("split", ["22/0", "14/8"])
 def test_no_unseen_class_is_a_node(ithor: SceneTables, glove: WordVectors, split: str) -> None:
     classes = make_task(TrainConfig(split=split), ithor, glove).classes
-    assert class_graph.normalised(classes).shape == (len(classes.known),) * 2
+    assert classes.normalised_adjacency().shape == (len(classes.known),) * 2
     assert len(ithor.classes) - len(classes.known) == int(split.partition("/")[2])

@@ -16,26 +16,26 @@ from tdanet_jax.config import NetworkConfig
 from tdanet_jax.models import actor_critic, li
 from tdanet_jax.models.actor_critic import ActorCritic, Output
 from tdanet_jax.models.mjolnir import KERNELS
-from tdanet_jax.models.shared.class_rows import class_rows, make_table
+from tdanet_jax.models.shared.class_rows import class_rows, make_row_table
 from tests.models.shared.test_adaptation import (
-    FRESH,
+    INTERVAL,
+    IS_FIRST,
     LIMIT,
     RATE,
-    STRETCH,
     assert_gradients_close,
     slow_rollout,
 )
 from tests.models.test_mjolnir import KNOWN, VOCABULARY, WORDS, observations, rows_of
 from tests.support import class_equations, equations, samples
 
-T, B, H, WIDTH = 5, 3, 4, 7  # two stretches of two steps, and one step more
+T, B, H, WIDTH = 5, 3, 4, 7  # two intervals of two steps, and one step
 MODEL = dataclasses.replace(
     li.make(NetworkConfig(width=WIDTH, hidden=H, inner_rate=RATE), VOCABULARY, jnp.float32),
-    stretch=STRETCH,
+    interval=INTERVAL,
     limit=LIMIT,
 )
 PLAIN = ActorCritic(MODEL.encoder, hidden=H)
-#: What all environments share: the whole graph but the linear layer behind it.
+#: What all environments share: the whole graph, except for the linear layer after it.
 SHARED = ("adjacency", *KERNELS, "last")
 CLOSE = {"rtol": 1e-3, "atol": 1e-4}  # float32 sums in another order, through inner steps
 
@@ -46,44 +46,44 @@ def parameters() -> Any:
 
 
 def inputs() -> tuple[Any, ...]:
-    """Observations, previous probabilities and episode starts of a rollout."""
-    fresh = FRESH[:T]
-    previous = np.random.default_rng(0).dirichlet(np.ones(6), (T, B))
-    previous = np.where(fresh[..., None], 0, previous)
-    return observations(T, B), jnp.asarray(previous, jnp.float32), jnp.asarray(fresh)
+    """Observations, previous action probabilities and episode starts of a rollout."""
+    is_first = IS_FIRST[:T]
+    prev_action_probs = np.random.default_rng(0).dirichlet(np.ones(6), (T, B))
+    prev_action_probs = np.where(is_first[..., None], 0, prev_action_probs)
+    return observations(T, B), jnp.asarray(prev_action_probs, jnp.float32), jnp.asarray(is_first)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def play(model: Any, params: Any, given: Any) -> Output:
-    table = actor_critic.prepare(model, params, WORDS)
+    class_table = actor_critic.prepare(model, params, WORDS)
     carry = model.initial_carry(B, params, training=True)
-    return actor_critic.forward(model, params, table, carry, *given)[1]
+    return actor_critic.forward(model, params, class_table, carry, *given)[1]
 
 
 def test_before_the_first_inner_step_it_is_the_published_network() -> None:
-    obs, previous, fresh = jax.tree.map(lambda x: x[:STRETCH], inputs())
+    obs, prev_action_probs, is_first = jax.tree.map(lambda x: x[:INTERVAL], inputs())
     exact, words = equations.in_float64(parameters()), np.asarray(WORDS, np.float64)
     rows = rows_of(samples.flat(obs))
     features = [class_equations.mjolnir_o(np, exact["encoder"], r, words, KNOWN) for r in rows]
-    actions = equations.relu(np, equations.linear(exact["action_embedding"], previous))
+    actions = equations.relu(np, equations.linear(exact["action_embedding"], prev_action_probs))
     zero = np.zeros((B, H))
-    x = np.reshape(features, (STRETCH, B, -1))
-    hidden, _ = equations.lstm_rollout(np, exact["lstm"], zero, zero, x, actions, fresh)
-    out = play(MODEL, parameters(), (obs, previous, fresh))
+    x = np.reshape(features, (INTERVAL, B, -1))
+    hidden, _ = equations.lstm_rollout(np, exact["lstm"], zero, zero, x, actions, is_first)
+    out = play(MODEL, parameters(), (obs, prev_action_probs, is_first))
     np.testing.assert_allclose(out.logits, equations.linear(exact["actor"], hidden), **CLOSE)
     value = equations.linear(exact["critic"], hidden)[..., 0]
     np.testing.assert_allclose(out.value, value, **CLOSE)
 
 
 def test_inner_steps_are_those_of_plain_per_environment_parameters() -> None:
-    given = jax.tree.map(lambda x: x[: STRETCH + 1], inputs())
+    given = jax.tree.map(lambda x: x[: INTERVAL + 1], inputs())
     out = play(MODEL, parameters(), given)
     plain = functools.partial(slow_rollout, plain=PLAIN, shared=SHARED)
     chex.assert_trees_all_close(out, jax.jit(plain)(parameters(), given), **CLOSE)
     still = play(dataclasses.replace(MODEL, rate=0.0), parameters(), given)
     changed = np.abs(out.logits - still.logits).max(axis=-1) > 1e-5
-    np.testing.assert_array_equal(changed[STRETCH], ~FRESH[STRETCH])
-    assert not changed[:STRETCH].any()
+    np.testing.assert_array_equal(changed[INTERVAL], ~IS_FIRST[INTERVAL])
+    assert not changed[:INTERVAL].any()
 
 
 @pytest.mark.slow
@@ -106,17 +106,17 @@ def test_gradients_are_those_of_plain_per_environment_parameters(first_order: bo
     )
 
 
-def test_every_environment_has_its_own_of_small_layers_but_of_the_convolutions() -> None:
-    own = MODEL.initial_carry(B, parameters()).own
-    assert set(own) == {"action_embedding", "encoder", "actor"}
-    assert jax.tree.map(jnp.shape, own["encoder"]) == {
+def test_small_layers_except_for_the_convolutions_have_per_environment_weights() -> None:
+    weights = MODEL.initial_carry(B, parameters()).per_environment
+    assert set(weights) == {"action_embedding", "encoder", "actor"}
+    assert jax.tree.map(jnp.shape, weights["encoder"]) == {
         "graph": {"mapping": {"kernel": (B, len(KNOWN), WIDTH), "bias": (B, WIDTH)}}
     }
 
 
-def test_what_it_remembers_of_a_frame_says_the_same() -> None:
+def test_the_stored_view_of_a_frame_has_the_same_rows() -> None:
     obs = observations(12)
     view = MODEL.encoder.view(obs)
-    table = make_table(WORDS, KNOWN)
-    np.testing.assert_array_equal(class_rows(table, view), class_rows(table, obs))
+    class_table = make_row_table(WORDS, KNOWN)
+    np.testing.assert_array_equal(class_rows(class_table, view), class_rows(class_table, obs))
     assert view.mask.shape == (12, len(KNOWN))

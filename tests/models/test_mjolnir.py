@@ -12,17 +12,16 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
-from tdanet_jax.env.dynamics import Observation
-from tdanet_jax.models import class_graph
-from tdanet_jax.models.classes import Classes
-from tdanet_jax.models.layers import TAPE
+from tdanet_jax.env.types import Observation
+from tdanet_jax.models.activation_cache import ACTIVATIONS
+from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.mjolnir import MjolnirOEncoder, MjolnirREncoder
 from tdanet_jax.models.shared.image import CELLS, CHANNELS, DROPOUT_UNITS
 from tests.support import class_equations, equations, samples
 from tests.support.samples import CLASSES, WIDTH
 
 KNOWN = (0, 1, 3, 4, 6, 8)
-VOCABULARY = Classes(
+VOCABULARY = ClassVocabulary(
     tuple(f"Class{i}" for i in range(CLASSES)), KNOWN, ((0, 3, 1.0), (1, 3, 1.0), (4, 8, 0.5))
 )
 T, B, H = 3, 4, 7
@@ -42,18 +41,18 @@ def both(module: MjolnirOEncoder, words: jax.Array, obs: Observation) -> jax.Arr
 
 
 @functools.cache
-def fresh_parameters() -> Any:
+def initial_parameters() -> Any:
     return encoder.init(jax.random.key(0), WORDS, observations(2), method=both)["params"]
 
 
 def parameters() -> Any:
     """Random ones; the adjacency is not symmetric, as it may become by training."""
-    return samples.randomised(fresh_parameters())
+    return samples.randomised(initial_parameters())
 
 
 @jax.jit
-def features(params: Any, obs: Observation, words: jax.Array = WORDS, tape: Any = None) -> Any:
-    variables = {"params": params} if tape is None else {"params": params, TAPE: tape}
+def features(params: Any, obs: Observation, words: jax.Array = WORDS, cache: Any = None) -> Any:
+    variables = {"params": params} if cache is None else {"params": params, ACTIVATIONS: cache}
     return encoder.apply(variables, words, obs, method=both)
 
 
@@ -74,22 +73,24 @@ def test_the_features_are_those_of_the_published_equations() -> None:
     np.testing.assert_allclose(found, np.stack(expected), **CLOSE)
 
 
-@pytest.mark.parametrize("taped", [False, True], ids=["computed", "from the tape"])
-def test_the_gradient_is_that_of_the_published_equations(taped: bool) -> None:
+@pytest.mark.parametrize("from_cache", [False, True], ids=["computed", "from the cache"])
+def test_the_gradient_is_that_of_the_published_equations(from_cache: bool) -> None:
     obs = observations(T, B)
     mix = np.random.default_rng(4).normal(size=(T, B, H + 5 * len(KNOWN))).astype(np.float32)
     contexts = [jnp.asarray(rows, jnp.float32) for rows in rows_of(samples.flat(obs))]
-    tape = None
-    if taped:
+    cache = None
+    if from_cache:
 
         def act(obs: Observation) -> Any:
             variables = {"params": parameters()}
-            return encoder.apply(variables, WORDS, obs, method=both, mutable=[TAPE])[1][TAPE]
+            return encoder.apply(variables, WORDS, obs, method=both, mutable=[ACTIVATIONS])[1][
+                ACTIVATIONS
+            ]
 
-        tape = jax.vmap(act)(obs)
+        cache = jax.vmap(act)(obs)
 
     def fast(params: Any) -> jax.Array:
-        return (features(params, obs, WORDS, tape) * mix).sum()
+        return (features(params, obs, WORDS, cache) * mix).sum()
 
     def slow(params: Any) -> jax.Array:
         found = [class_equations.mjolnir_o(jnp, params, rows, WORDS, KNOWN) for rows in contexts]
@@ -101,7 +102,7 @@ def test_the_gradient_is_that_of_the_published_equations(taped: bool) -> None:
 
 def test_layers_and_their_sizes_and_the_graph_at_the_start() -> None:
     n, h = len(KNOWN), len(KNOWN) + WIDTH
-    assert jax.tree.map(jnp.shape, fresh_parameters()) == {
+    assert jax.tree.map(jnp.shape, initial_parameters()) == {
         "graph": {
             "adjacency": (n, n),
             "kernels_0": {"kernel": (h, h)},
@@ -111,8 +112,8 @@ def test_layers_and_their_sizes_and_the_graph_at_the_start() -> None:
             "mapping": {"kernel": (n, H), "bias": (H,)},
         }
     }
-    adjacency = fresh_parameters()["graph"]["adjacency"]
-    np.testing.assert_array_equal(adjacency, class_graph.normalised(VOCABULARY))
+    adjacency = initial_parameters()["graph"]["adjacency"]
+    np.testing.assert_array_equal(adjacency, VOCABULARY.normalised_adjacency())
 
 
 def test_a_bfloat16_encoder_is_close_and_returns_float32() -> None:
@@ -141,20 +142,20 @@ class Case(NamedTuple):
     params: Any
     obs: Observation
     action: jax.Array
-    keep: jax.Array | None
+    dropout_mask: jax.Array | None
 
 
 def image_case(maps: bool, training: bool) -> Case:
     module = MjolnirREncoder(classes=VOCABULARY, features=H, dropout=0.25, maps=maps)
     rng, obs = np.random.default_rng(7), observations(2, 2)
     action = jnp.asarray(rng.normal(size=(2, 2, 10)), jnp.float32)
-    keep = jnp.asarray(rng.random((2, 2, DROPOUT_UNITS)) < 0.75) if training else None
+    dropout_mask = jnp.asarray(rng.random((2, 2, DROPOUT_UNITS)) < 0.75) if training else None
 
     def both(module: MjolnirREncoder) -> jax.Array:
         return module(module.prepare(WORDS), *jax.tree.map(lambda x: x[0], (obs, action)))
 
     params = samples.randomised(jax.jit(nn.init(both, module))(jax.random.key(0))["params"])
-    return Case(module, params, obs, action, keep)
+    return Case(module, params, obs, action, dropout_mask)
 
 
 def published(xp: Any, case: Case, params: Any, words: Any) -> Any:
@@ -162,14 +163,14 @@ def published(xp: Any, case: Case, params: Any, words: Any) -> Any:
     obs, found = samples.flat(case.obs), []
     action = np.asarray(case.action).reshape(4, -1)
     for i, rows in enumerate(rows_of(obs)):
-        maps, kept = None, None
+        maps, masks = None, None
         if case.encoder.maps:
             maps = xp.asarray(np.asarray(obs.features)[i], words.dtype)
-        if case.keep is not None:
-            kept = np.reshape(case.keep, (4, 2, CELLS, CHANNELS))[i]
+        if case.dropout_mask is not None:
+            masks = np.reshape(case.dropout_mask, (4, 2, CELLS, CHANNELS))[i]
         image = equations.image(
             xp, params["trunk"], np.asarray(obs.cells)[i], words, int(obs.target[i]), action[i],
-            kept, maps=maps,
+            masks, maps=maps,
         )  # fmt: skip
         rows = xp.asarray(rows, words.dtype)
         found.append(class_equations.mjolnir_r(xp, params, rows, words, KNOWN, image))
@@ -189,8 +190,10 @@ def test_with_an_image_it_is_the_published_encoder_and_has_its_gradient(
 
     def fast(params: Any) -> tuple[jax.Array, jax.Array]:
         variables = {"params": params}
-        table = case.encoder.apply(variables, WORDS, method="prepare")
-        out: Any = case.encoder.apply(variables, table, case.obs, case.action, case.keep)
+        class_table = case.encoder.apply(variables, WORDS, method="prepare")
+        out: Any = case.encoder.apply(
+            variables, class_table, case.obs, case.action, case.dropout_mask
+        )
         out = out.reshape(4, -1)
         return (out * mix).sum(), out
 

@@ -5,10 +5,9 @@ import jax.numpy as jnp
 import pytest
 
 from tdanet_jax.config import NetworkConfig, TrainConfig
-from tdanet_jax.models.registry import MODELS
 from tdanet_jax.models import parameter_count
-from tdanet_jax.models.classes import Classes
-from tdanet_jax.models.registry import make_model
+from tdanet_jax.models.classes import ClassVocabulary
+from tdanet_jax.models.registry import MODELS, make_model
 
 NAMES = tuple(f"Class{i}" for i in range(9))
 
@@ -47,8 +46,8 @@ def test_the_published_counts_by_hand():
 @pytest.mark.parametrize("name", MODELS)
 def test_the_trained_count_is_what_an_optimiser_changes(name):
     config = TrainConfig(model=name, network=NetworkConfig(width=8, hidden=6))
-    model = make_model(config, Classes(NAMES, tuple(range(7))))
+    model = make_model(config, ClassVocabulary(NAMES, tuple(range(7))))
     weights = jax.jit(model.initialise)(jax.random.key(0), jnp.ones((9, 5)))
     found = parameter_count.count(model, 9, 5)
     assert found.trained == sum(leaf.size for leaf in jax.tree.leaves(weights))
-    assert found.published == found.trained + sum(found.beside.values())
+    assert found.published == found.trained + sum(found.extra.values())

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tdanet_jax.models import class_graph, sp
-from tdanet_jax.models.classes import Classes
+from tdanet_jax.models import sp
+from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.sp import ScenePriorsEncoder
 from tests.support import equations, samples
 from tests.support.samples import CLASSES, observations
@@ -21,7 +21,8 @@ CLOSE = {"rtol": 5e-5, "atol": 1e-5}  # float32 sums in another order
 WORDS = jnp.asarray(samples.words())
 KNOWN = (0, 1, 3, 4, 7)
 EDGES = ((0, 3, 1.0), (1, 3, 0.5), (4, 7, 1.0), (0, 4, 0.25))
-ADJACENCY = class_graph.normalised(Classes(tuple(map(str, range(CLASSES))), KNOWN, EDGES))
+VOCABULARY = ClassVocabulary(tuple(map(str, range(CLASSES))), KNOWN, EDGES)
+ADJACENCY = VOCABULARY.normalised_adjacency()
 ENCODER = ScenePriorsEncoder(
     known=KNOWN, adjacency=tuple(map(tuple, ADJACENCY.tolist())), features=6, width=8
 )
@@ -31,8 +32,8 @@ ACTION = jnp.asarray(np.random.default_rng(0).normal(size=(T, B, 10)), jnp.float
 def frames() -> Any:
     """Observations of a few classes each."""
     obs = observations(T, B)
-    kept = np.random.default_rng(5).random(obs.cells.shape) < 0.04
-    return obs.replace(cells=jnp.where(kept, obs.cells, -1))
+    shown = np.random.default_rng(5).random(obs.cells.shape) < 0.04
+    return obs.replace(cells=jnp.where(shown, obs.cells, -1))
 
 
 @functools.cache
@@ -48,8 +49,8 @@ def parameters() -> Any:
 
 @jax.jit
 def features(params: Any, obs: Any, action: jax.Array, words: jax.Array = WORDS) -> jax.Array:
-    table = ENCODER.apply({"params": params}, words, method="prepare")
-    return ENCODER.apply({"params": params}, table, obs, action)
+    class_table = ENCODER.apply({"params": params}, words, method="prepare")
+    return ENCODER.apply({"params": params}, class_table, obs, action)
 
 
 def plain(xp: Any, params: Any) -> Any:
@@ -104,7 +105,7 @@ def test_classes_that_are_not_known_change_nothing_in_the_graph() -> None:
 
 def test_the_published_size() -> None:
     n = 83  # classes of the published graph
-    classes = Classes(tuple(map(str, range(n))), tuple(range(n)))
+    classes = ClassVocabulary(tuple(map(str, range(n))), tuple(range(n)))
     model = sp.make(sp.NetworkConfig(), classes, jnp.float32)
     shapes = jax.eval_shape(model.initialise, jax.random.key(0), jnp.zeros((n, 300)))["encoder"]
     shapes.pop("trunk")

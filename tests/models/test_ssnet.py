@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tdanet_jax.env.dynamics import Observation
+from tdanet_jax.env.types import Observation
 from tdanet_jax.models import actor_critic
+from tdanet_jax.models.activation_cache import ACTIVATIONS
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.layers import TAPE
-from tdanet_jax.models.shared.class_rows import class_rows, make_table
+from tdanet_jax.models.shared.class_rows import class_rows, make_row_table
 from tdanet_jax.models.ssnet import SSNetEncoder
 from tests.support import class_equations, equations, samples
 from tests.support.samples import CLASSES
@@ -40,8 +40,8 @@ def parameters() -> Any:
 
 @jax.jit
 def features(params: Any, obs: Observation, words: jax.Array = WORDS) -> jax.Array:
-    table = encoder.apply({"params": params}, words, method="prepare")
-    return encoder.apply({"params": params}, table, obs, None)
+    class_table = encoder.apply({"params": params}, words, method="prepare")
+    return encoder.apply({"params": params}, class_table, obs, None)
 
 
 def plain(xp: Any, params: Any, obs: Observation) -> Any:
@@ -56,7 +56,7 @@ def plain(xp: Any, params: Any, obs: Observation) -> Any:
 
 def test_a_row_is_present_x_y_area_and_the_cosine_to_the_target() -> None:
     obs = observations(B)
-    found = class_rows(make_table(WORDS, KNOWN), obs)
+    found = class_rows(make_row_table(WORDS, KNOWN), obs)
     words = np.asarray(WORDS, np.float64)
     for i, frame in enumerate(class_equations.frames(obs, words)):
         expected = class_equations.context(*frame, words, KNOWN)
@@ -66,9 +66,9 @@ def test_a_row_is_present_x_y_area_and_the_cosine_to_the_target() -> None:
 
 
 def test_a_class_without_a_word_vector_is_like_no_target() -> None:
-    table = make_table(WORDS.at[3].set(0.0), KNOWN)
-    assert not np.asarray(table.cosine)[:, KNOWN.index(3)].any()
-    assert np.isfinite(table.cosine).all()
+    class_table = make_row_table(WORDS.at[3].set(0.0), KNOWN)
+    assert not np.asarray(class_table.cosine)[:, KNOWN.index(3)].any()
+    assert np.isfinite(class_table.cosine).all()
 
 
 def test_the_features_are_those_of_the_published_equations() -> None:
@@ -79,22 +79,22 @@ def test_the_features_are_those_of_the_published_equations() -> None:
     np.testing.assert_allclose(found, expected, **CLOSE)
 
 
-@pytest.mark.parametrize("taped", [False, True], ids=["computed", "from the tape"])
-def test_the_gradient_is_that_of_the_published_equations(taped: bool) -> None:
+@pytest.mark.parametrize("from_cache", [False, True], ids=["computed", "from the cache"])
+def test_the_gradient_is_that_of_the_published_equations(from_cache: bool) -> None:
     obs = observations(T, B)
     mix = jnp.asarray(np.random.default_rng(4).normal(size=(T, B, 5 * len(KNOWN))), jnp.float32)
-    table, flat = make_table(WORDS, KNOWN), samples.flat(obs)
+    class_table, flat = make_row_table(WORDS, KNOWN), samples.flat(obs)
     variables: dict[str, Any] = {}
-    if taped:
+    if from_cache:
         step = jax.vmap(
-            lambda obs: encoder.apply({"params": parameters()}, table, obs, None, mutable=[TAPE])[
-                1
-            ][TAPE]
+            lambda obs: encoder.apply(
+                {"params": parameters()}, class_table, obs, None, mutable=[ACTIVATIONS]
+            )[1][ACTIVATIONS]
         )
-        variables = {TAPE: step(obs)}
+        variables = {ACTIVATIONS: step(obs)}
 
     def fast(params: Any) -> jax.Array:
-        return (encoder.apply({"params": params, **variables}, table, obs, None) * mix).sum()
+        return (encoder.apply({"params": params, **variables}, class_table, obs, None) * mix).sum()
 
     def slow(params: Any) -> jax.Array:
         return (plain(jnp, params, flat) * mix.reshape(T * B, -1)).sum()
@@ -107,16 +107,23 @@ def test_the_whole_network_is_the_published_one() -> None:
     """The last action probabilities enter the LSTM as they are."""
     model = ActorCritic(encoder, hidden=H)
     weights = samples.parameters(model, WORDS)
-    obs, fresh = observations(B), jnp.asarray([True, False, False, True])
+    obs, is_first = observations(B), jnp.asarray([True, False, False, True])
     rng = np.random.default_rng(0)
-    previous = jnp.asarray(rng.dirichlet(np.ones(6), B), jnp.float32)
+    prev_action_probs = jnp.asarray(rng.dirichlet(np.ones(6), B), jnp.float32)
     carry = tuple(jnp.asarray(rng.normal(size=(B, H)), jnp.float32) for _ in range(2))
-    table = actor_critic.prepare(model, weights, WORDS)
-    _, out = actor_critic.forward(model, weights, table, carry, obs, previous, fresh)
+    class_table = actor_critic.prepare(model, weights, WORDS)
+    _, out = actor_critic.forward(
+        model, weights, class_table, carry, obs, prev_action_probs, is_first
+    )
     exact = equations.in_float64(weights)
     x = plain(np, exact["encoder"], obs)
     hidden, _ = equations.lstm_rollout(
-        np, exact["lstm"], *np.asarray(carry), x[None], np.asarray(previous)[None], fresh[None]
+        np,
+        exact["lstm"],
+        *np.asarray(carry),
+        x[None],
+        np.asarray(prev_action_probs)[None],
+        is_first[None],
     )
     np.testing.assert_allclose(out.logits, equations.linear(exact["actor"], hidden[0]), **CLOSE)
     value = equations.linear(exact["critic"], hidden[0])[..., 0]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tdanet_jax.env.dynamics import Observation
+from tdanet_jax.env.types import Observation
 from tdanet_jax.models.tdanet import TDANetEncoder
 from tests.support import equations, samples
 from tests.support.samples import CLASSES, DETECTIONS, WIDTH, observations
@@ -46,23 +46,23 @@ def features(
     params: Any,
     obs: Observation,
     words: np.ndarray | jax.Array,
-    keep: jax.Array | None = None,
+    dropout_mask: jax.Array | None = None,
     attention: bool = True,
     siamese: bool = True,
 ) -> jax.Array:
     module = encoder(attention, siamese)
-    table = module.apply({"params": params}, jnp.asarray(words), method="prepare")
-    return module.apply({"params": params}, table, obs, None, keep)
+    class_table = module.apply({"params": params}, jnp.asarray(words), method="prepare")
+    return module.apply({"params": params}, class_table, obs, None, dropout_mask)
 
 
 @functools.partial(jax.jit, static_argnames="attention")
 def weights(params: Any, obs: Observation, words: np.ndarray, attention: bool = True) -> jax.Array:
     module = encoder(attention)
-    table = module.apply({"params": params}, jnp.asarray(words), method="prepare")
-    return module.apply({"params": params}, table, obs, method="attend")
+    class_table = module.apply({"params": params}, jnp.asarray(words), method="prepare")
+    return module.apply({"params": params}, class_table, obs, method="attend")
 
 
-def kept(shape: tuple[int, ...]) -> jax.Array:
+def random_mask(shape: tuple[int, ...]) -> jax.Array:
     return jnp.asarray(np.random.default_rng(3).random((*shape, H)) < 0.75)
 
 
@@ -72,13 +72,13 @@ def test_the_fast_forms_equal_the_printed_equations(
     attention: bool, siamese: bool, dropped: bool
 ) -> None:
     params, words, obs = parameters(attention, siamese), samples.words(), observations(FRAMES)
-    keep = kept((FRAMES,)) if dropped else None
-    fast = features(params, obs, words, keep, attention, siamese)
+    dropout_mask = random_mask((FRAMES,)) if dropped else None
+    fast = features(params, obs, words, dropout_mask, attention, siamese)
     exact = equations.in_float64(params)
     plain = [
         equations.encode(
             np, exact, rows.astype(float), word.astype(float), target_attention=attention,
-            siamese=siamese, dropped=None if keep is None else ~np.asarray(keep)[i],
+            siamese=siamese, dropped=None if dropout_mask is None else ~np.asarray(dropout_mask)[i],
         )
         for i, (rows, word) in enumerate(equations.frames(obs, words))
     ]  # fmt: skip
@@ -91,7 +91,7 @@ def test_the_fast_forms_have_the_gradient_of_the_printed_equations(
     attention: bool, siamese: bool, backend: None
 ) -> None:
     params, words, obs = parameters(attention, siamese), samples.words(), observations(FRAMES)
-    keep = kept((FRAMES,))
+    dropout_mask = random_mask((FRAMES,))
     mix = np.random.default_rng(4).normal(size=(FRAMES, H)).astype(np.float32)
     frames = equations.frames(obs, words)
 
@@ -100,13 +100,13 @@ def test_the_fast_forms_have_the_gradient_of_the_printed_equations(
         for i, (rows, word) in enumerate(frames):
             found = equations.encode(
                 jnp, params, jnp.asarray(rows, jnp.float32), jnp.asarray(word),
-                target_attention=attention, siamese=siamese, dropped=~keep[i],
+                target_attention=attention, siamese=siamese, dropped=~dropout_mask[i],
             )  # fmt: skip
             total += (found * mix[i]).sum()
         return total
 
     def fast(params: Any) -> jax.Array:
-        return (features(params, obs, words, keep, attention, siamese) * mix).sum()
+        return (features(params, obs, words, dropout_mask, attention, siamese) * mix).sum()
 
     chex.assert_trees_all_close(
         jax.jit(jax.grad(fast))(params), jax.jit(jax.grad(plain))(params), rtol=1e-4, atol=1e-5
@@ -236,11 +236,11 @@ def test_an_empty_frame_is_one_all_zero_row_and_not_a_row_of_the_first_class() -
 @pytest.mark.parametrize("shape", [(4,), (3, 2)])
 def test_dropout_is_the_mask_that_is_given(shape: tuple[int, ...]) -> None:
     params, words, obs = parameters(), samples.words(), observations(*shape)
-    keep = kept(shape)
-    first, second = (features(params, obs, words, keep) for _ in range(2))
+    dropout_mask = random_mask(shape)
+    first, second = (features(params, obs, words, dropout_mask) for _ in range(2))
     chex.assert_trees_all_equal(first, second)
     assert not np.allclose(first, features(params, obs, words))
-    assert not np.allclose(first, features(params, obs, words, ~keep))
+    assert not np.allclose(first, features(params, obs, words, ~dropout_mask))
 
 
 def test_dropout_scales_what_it_keeps() -> None:
@@ -290,8 +290,8 @@ def test_layers_and_their_sizes() -> None:
 def test_a_bfloat16_encoder_is_close_and_returns_float32() -> None:
     params, words, obs = parameters(), jnp.asarray(samples.words()), observations(FRAMES)
     module = TDANetEncoder(H, dtype=jnp.bfloat16)
-    table = module.apply({"params": params}, words, method="prepare")
-    half = module.apply({"params": params}, table, obs, None)
+    class_table = module.apply({"params": params}, words, method="prepare")
+    half = module.apply({"params": params}, class_table, obs, None)
     full = features(params, obs, words)
     assert half.dtype == jnp.float32
     # Eight bits of mantissa through four layers.

@@ -1,4 +1,4 @@
-"""The published networks with a row per class, one frame at a time, no table, no tape.
+"""The published networks with a row per class, one frame at a time, without class table or cache.
 
 As in `equations`, every function takes the array module first: NumPy for golden values in float64,
 `jax.numpy` for gradients of the plain form. n known classes, D wide word vectors.

@@ -1,4 +1,4 @@
-"""The network as printed: Eqs. 1 and 2 of the paper, one frame at a time, no table, no tape.
+"""The network as printed: Eqs. 1 and 2 of the paper, frame by frame, without class table or cache.
 
 Every function takes the array module first: NumPy for golden values in float64, `jax.numpy` for
 gradients of the plain form.
@@ -94,8 +94,8 @@ def image(
       words: [C, D].
       target: class of the target.
       action: [10], embedding of the previous action probabilities.
-      kept: [2, 49, 64] bool, units that dropout keeps behind each convolution.
-      maps: [49, 512], ResNet-18's feature map, in place of the raster.
+      kept: [2, 49, 64] bool, units that dropout keeps after each convolution.
+      maps: [49, 512], ResNet-18's feature map, instead of the raster.
     """
 
     def drop(x: Array, layer: int, cell: int) -> Array:
@@ -134,12 +134,12 @@ def scene_priors(
 
 
 def lstm(
-    xp: Any, params: Params, hidden: Array, cell: Array, x: Array, aside: Array
+    xp: Any, params: Params, hidden: Array, cell: Array, x: Array, skip_inputs: Array
 ) -> tuple[Array, Array]:
-    """One step on the inputs [x, aside], with the gates in the order i, f, g, o and two biases."""
+    """One step on [x, skip_inputs], with the gates in the order i, f, g, o and two biases."""
     first, last = params["kernel"][: x.shape[-1]], params["kernel"][x.shape[-1] :]
-    kernel = xp.concatenate([first, params.get("kernel_aside", last[:0]), last])
-    z = xp.concatenate([x, aside, hidden], axis=-1) @ kernel
+    kernel = xp.concatenate([first, params.get("kernel_skip", last[:0]), last])
+    z = xp.concatenate([x, skip_inputs, hidden], axis=-1) @ kernel
     z = z + params["bias_ih"] + params["bias_hh"]
     i, f, g, o = xp.split(z, 4, axis=-1)
     cell = sigmoid(xp, f) * cell + sigmoid(xp, i) * xp.tanh(g)
@@ -147,14 +147,20 @@ def lstm(
 
 
 def lstm_rollout(
-    xp: Any, params: Params, hidden: Array, cell: Array, x: Array, aside: Array, fresh: Array
+    xp: Any,
+    params: Params,
+    hidden: Array,
+    cell: Array,
+    x: Array,
+    skip_inputs: Array,
+    is_first: Array,
 ) -> tuple[Array, tuple[Array, Array]]:
-    """Hidden states [T, B, H] of T steps and the last carry; the carry is zero where fresh."""
+    """Hidden states [T, B, H] of T steps and the last carry; the carry is zero where `is_first`."""
     out = []
-    for x_t, aside_t, fresh_t in zip(x, aside, fresh, strict=True):
-        hidden = xp.where(fresh_t[:, None], 0.0, hidden)
-        cell = xp.where(fresh_t[:, None], 0.0, cell)
-        hidden, cell = lstm(xp, params, hidden, cell, x_t, aside_t)
+    for x_t, skip_t, is_first_t in zip(x, skip_inputs, is_first, strict=True):
+        hidden = xp.where(is_first_t[:, None], 0.0, hidden)
+        cell = xp.where(is_first_t[:, None], 0.0, cell)
+        hidden, cell = lstm(xp, params, hidden, cell, x_t, skip_t)
         out.append(hidden)
     return xp.stack(out), (hidden, cell)
 
@@ -180,9 +186,9 @@ def actor_critic(
     xp: Any,
     params: Params,
     frames: list[list[tuple[Array, Array]]],
-    previous: Array,
+    prev_action_probs: Array,
     carry: tuple[Array, Array],
-    fresh: Array,
+    is_first: Array,
     dropped: Array | None = None,
     **encoder: Any,
 ) -> tuple[Array, Array]:
@@ -197,8 +203,10 @@ def actor_critic(
             for b, frame in enumerate(row)
         ]  # fmt: skip
         inputs.append(xp.stack(features))
-        actions.append(relu(xp, linear(params["action_embedding"], previous[t])))
-    hidden, _ = lstm_rollout(xp, params["lstm"], *carry, xp.stack(inputs), xp.stack(actions), fresh)
+        actions.append(relu(xp, linear(params["action_embedding"], prev_action_probs[t])))
+    hidden, _ = lstm_rollout(
+        xp, params["lstm"], *carry, xp.stack(inputs), xp.stack(actions), is_first
+    )
     return linear(params["actor"], hidden), linear(params["critic"], hidden)[..., 0]
 
 

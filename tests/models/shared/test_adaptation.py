@@ -14,27 +14,26 @@ import numpy as np
 import pytest
 
 from tdanet_jax.config import LearnerConfig
-from tdanet_jax.env import dynamics
 from tdanet_jax.env.reward import Parents
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output
 from tdanet_jax.models.baseline import BaselineEncoder
-from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic, LearnedLoss, Memory
+from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic, AdaptiveState, LearnedLoss
 from tdanet_jax.models.shared.image import DROPOUT_UNITS
 from tdanet_jax.training import learner
 from tests.support import samples
 from tests.training.test_learner import house
 
-T, B, H = 7, 3, 4  # three stretches of two steps, and one step more
-STRETCH, LIMIT, RATE = 2, 2, 0.02
+T, B, H = 7, 3, 4  # three intervals of two steps, and one step
+INTERVAL, LIMIT, RATE = 2, 2, 0.02
 WORDS = jnp.asarray(samples.words())
 ENCODER = BaselineEncoder(dropout=0.25)
-MODEL = AdaptiveActorCritic(ENCODER, hidden=H, rate=RATE, stretch=STRETCH, limit=LIMIT)
+MODEL = AdaptiveActorCritic(ENCODER, hidden=H, rate=RATE, interval=INTERVAL, limit=LIMIT)
 PLAIN = ActorCritic(ENCODER, hidden=H)
-#: The first environment adapts twice and no more; the others begin an episode within and with a
-#: stretch.
-FRESH = np.zeros((T, B), bool)
-FRESH[0, 0] = FRESH[3, 1] = FRESH[2, 2] = True
+#: The first environment adapts twice and no more; the others begin an episode within an
+#: interval and at its start.
+IS_FIRST = np.zeros((T, B), bool)
+IS_FIRST[0, 0] = IS_FIRST[3, 1] = IS_FIRST[2, 2] = True
 CLOSE = {"rtol": 1e-3, "atol": 1e-4}  # float32 sums of thousands of products, through inner steps
 
 
@@ -46,25 +45,25 @@ def parameters(model: AdaptiveActorCritic = MODEL) -> Any:
     return {**params, "lstm": lstm}
 
 
-def inputs(senses: bool = False) -> tuple[Any, ...]:
-    """Observations, previous probabilities, episode starts and dropout of a rollout."""
+def inputs(odometry: bool = False) -> tuple[Any, ...]:
+    """Observations, previous action probabilities, starts and dropout mask of a rollout."""
     rng = np.random.default_rng(0)
-    previous = np.where(FRESH[..., None], 0, rng.dirichlet(np.ones(6), (T, B)))
-    keep = jnp.asarray(rng.random((T, B, DROPOUT_UNITS)) < 0.75)
+    prev_action_probs = np.where(IS_FIRST[..., None], 0, rng.dirichlet(np.ones(6), (T, B)))
+    dropout_mask = jnp.asarray(rng.random((T, B, DROPOUT_UNITS)) < 0.75)
     obs = samples.observations(T, B)
-    if senses:
-        obs = obs.replace(odometry=samples.odometry(T, B))
-    return obs, jnp.asarray(previous, jnp.float32), jnp.asarray(FRESH), keep
+    if odometry:
+        obs = obs.replace(sensors=samples.readings(T, B))
+    return obs, jnp.asarray(prev_action_probs, jnp.float32), jnp.asarray(IS_FIRST), dropout_mask
 
 
-def start(params: Any, batch: int = B, model: AdaptiveActorCritic = MODEL) -> Memory:
+def start(params: Any, batch: int = B, model: AdaptiveActorCritic = MODEL) -> AdaptiveState:
     return model.initial_carry(batch, params, training=True)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def play(model: AdaptiveActorCritic, params: Any, memory: Memory, given: Any) -> Any:
-    table = actor_critic.prepare(model, params, WORDS)
-    return actor_critic.forward(model, params, table, memory, *given)
+def play(model: AdaptiveActorCritic, params: Any, state: AdaptiveState, given: Any) -> Any:
+    class_table = actor_critic.prepare(model, params, WORDS)
+    return actor_critic.forward(model, params, class_table, state, *given)
 
 
 def learned_loss(params: Any, record: jax.Array) -> jax.Array:
@@ -91,10 +90,10 @@ def adapted(params: Any, shared: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def joined(params: Any, own: dict[str, Any]) -> Any:
-    """The parameters, with those by path in place of their own."""
+def joined(params: Any, new: dict[str, Any]) -> Any:
+    """The parameters, some of them replaced by path."""
     return jax.tree.map_with_path(
-        lambda path, leaf: own.get(jax.tree_util.keystr(path), leaf), params
+        lambda path, leaf: new.get(jax.tree_util.keystr(path), leaf), params
     )
 
 
@@ -105,10 +104,10 @@ def slow(
     plain: ActorCritic = PLAIN,
     shared: Sequence[str] = (),
 ) -> Output:
-    """One environment's rollout: all its parameters are its own, its gradients `jax.grad`'s.
+    """One environment's rollout: it has all parameters to itself, gradients by `jax.grad`.
 
     Args:
-      given: what it is shown, [T, 1, ...].
+      given: the network's inputs, [T, 1, ...].
       plain: the network without adaptation.
       shared: names of parameters and layers that are not adapted.
     """
@@ -116,34 +115,34 @@ def slow(
     theta, carry, count, outs = network, plain.initial_carry(1, network), 0, []
 
     def step(theta: Any, carry: Any, shown: Any) -> tuple[Any, Output]:
-        table = actor_critic.prepare(plain, theta, WORDS)
-        return actor_critic.forward(plain, theta, table, carry, *shown)
+        class_table = actor_critic.prepare(plain, theta, WORDS)
+        return actor_critic.forward(plain, theta, class_table, carry, *shown)
 
-    def inner(own: Any, theta: Any, carry: Any, stretch: list[Any]) -> jax.Array:
+    def inner(own: Any, theta: Any, carry: Any, interval: list[Any]) -> jax.Array:
         theta, record = joined(theta, own), []
-        for shown in stretch:
+        for shown in interval:
             carry, out = step(theta, carry, shown)
             record.append(jnp.concatenate([carry[0][0], jax.nn.softmax(out.logits[0])]))
         return learned_loss(params["learned_loss"], jnp.stack(record))
 
     steps = len(given[2])
-    for begin in range(0, steps, STRETCH):
-        stretch = [
+    for begin in range(0, steps, INTERVAL):
+        interval = [
             jax.tree.map(lambda x, t=t: x[t], given)
-            for t in range(begin, min(begin + STRETCH, steps))
+            for t in range(begin, min(begin + INTERVAL, steps))
         ]
-        fresh = jnp.stack([shown[2][0] for shown in stretch])
+        is_first = jnp.stack([shown[2][0] for shown in interval])
         before = carry
-        for shown in stretch:
+        for shown in interval:
             begun = shown[2][0]
             theta = jax.tree.map(lambda own, new, b=begun: jnp.where(b, new, own), theta, network)
             count = jnp.where(begun, 0, count)
             carry, out = step(theta, carry, shown)
             outs.append(out)
-        if len(stretch) == STRETCH:
+        if len(interval) == INTERVAL:
             at = jax.lax.stop_gradient((theta, before)) if first_order else (theta, before)
-            grad = jax.grad(inner)(adapted(at[0], shared), *at, stretch)
-            due = ~fresh[1:].any() & (count < LIMIT)
+            grad = jax.grad(inner)(adapted(at[0], shared), *at, interval)
+            due = ~is_first[1:].any() & (count < LIMIT)
             own = adapted(theta, shared)
             own = jax.tree.map(lambda p, g, d=due: jnp.where(d, p - RATE * g, p), own, grad)
             theta = joined(theta, own)
@@ -158,27 +157,28 @@ def slow_rollout(params: Any, given: Any, first_order: bool = False, **network: 
     return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), out)
 
 
-#: What an environment does not adapt for itself: the layer that reads the odometry.
-NOT_ADAPTED = ("way",)
+#: The layer that is not adapted.
+NOT_ADAPTED = ("sensor_embedding",)
 
 
-@pytest.mark.parametrize("senses", [False, True], ids=["plain", "odometry"])
-def test_values_are_those_of_plain_per_environment_parameters(senses: bool) -> None:
-    model, plain = (m.clone(odometry=senses) for m in (MODEL, PLAIN))
+@pytest.mark.parametrize("odometry", [False, True], ids=["plain", "odometry"])
+def test_values_are_those_of_plain_per_environment_parameters(odometry: bool) -> None:
+    spec = ObservationSpec(sensors=("odometry",) if odometry else ())
+    model, plain = (m.clone(spec=spec) for m in (MODEL, PLAIN))
     params = parameters(model)
-    given = jax.tree.map(lambda x: x[:3], inputs(senses))  # a stretch, and one step behind it
+    given = jax.tree.map(lambda x: x[:3], inputs(odometry))  # an interval, and one step after it
     _, out = play(model, params, start(params, model=model), given)
     slow = functools.partial(slow_rollout, plain=plain, shared=NOT_ADAPTED)
     chex.assert_trees_all_close(out, jax.jit(slow)(params, given), **CLOSE)
-    if senses:
-        still = given[0].replace(odometry=jax.tree.map(jnp.zeros_like, given[0].odometry))
+    if odometry:
+        still = given[0].replace(sensors=jax.tree.map(jnp.zeros_like, given[0].sensors))
         _, other = play(model, params, start(params, model=model), (still, *given[1:]))
         assert np.all(np.abs(out.logits - other.logits).max(-1) > 1e-4)
 
 
-def test_what_a_network_does_not_use_of_the_observations_is_not_remembered() -> None:
-    """The environment may hold odometry for another network's sake."""
-    given = jax.tree.map(lambda x: x[0], inputs(senses=True))
+def test_unused_parts_of_the_observations_are_not_stored() -> None:
+    """The environment may have sensors that another network needs."""
+    given = jax.tree.map(lambda x: x[0], inputs(odometry=True))
     params = parameters()
     _, out = play(MODEL, params, start(params), given)
     _, plain = play(MODEL, params, start(params), jax.tree.map(lambda x: x[0], inputs()))
@@ -191,7 +191,7 @@ def test_values_and_gradients_are_those_of_plain_per_environment_parameters(
     first_order: bool,
 ) -> None:
     model = dataclasses.replace(MODEL, first_order=first_order)
-    given = jax.tree.map(lambda x: x[:5], inputs())  # two stretches, and one step behind them
+    given = jax.tree.map(lambda x: x[:5], inputs())  # two intervals, and one step after them
     mix = np.random.default_rng(2).normal(size=(5, B, 6)).astype(np.float32)
 
     def mixed(out: Output) -> tuple[jax.Array, Output]:
@@ -228,9 +228,9 @@ def test_the_inner_steps_change_what_follows_them_and_no_other_episode() -> None
     changed = np.abs(out.logits - plain.logits).max(-1) > 1e-5
     expected = np.ones((T, B), bool)
     expected[:2] = False  # nothing has been adapted yet
-    expected[3, 1] = False  # a new episode, within a stretch ...
-    expected[2:4, 2] = False  # ... and with one
-    # The second environment's new episode adapts behind step 5 for the first time.
+    expected[3, 1] = False  # a new episode, within an interval ...
+    expected[2:4, 2] = False  # ... and at its start
+    # The second environment's new episode first adapts after step 5.
     expected[4:6, 1] = False
     np.testing.assert_array_equal(changed, expected)
 
@@ -241,14 +241,14 @@ def test_the_plain_network_is_the_one_that_adapts() -> None:
     still = dataclasses.replace(MODEL, rate=0.0)
     _, out = play(still, params, start(params), inputs())
     network = {name: value for name, value in params.items() if name != "learned_loss"}
-    table = actor_critic.prepare(PLAIN, network, WORDS)
+    class_table = actor_critic.prepare(PLAIN, network, WORDS)
     _, plain = actor_critic.forward(
-        PLAIN, network, table, PLAIN.initial_carry(B, network), *inputs()
+        PLAIN, network, class_table, PLAIN.initial_carry(B, network), *inputs()
     )
     chex.assert_trees_all_close(out, plain, **CLOSE)
 
 
-def test_a_rollout_equals_its_steps_and_so_does_what_it_remembers() -> None:
+def test_a_rollout_equals_its_steps_and_stores_the_same() -> None:
     params, given = parameters(), inputs()
     memory, outs = start(params), []
     for t in range(T):
@@ -256,7 +256,7 @@ def test_a_rollout_equals_its_steps_and_so_does_what_it_remembers() -> None:
         outs.append(out)
     last, whole = play(MODEL, params, start(params), given)
     chex.assert_trees_all_close(jax.tree.map(lambda *x: jnp.stack(x), *outs), whole, **CLOSE)
-    # Of a stretch that is not full, the steps behind its last are those of the stretch before.
+    # In an interval that is not full, the rest are steps of the interval before.
     for mine, theirs in zip(memory.steps, last.steps, strict=True):
         chex.assert_trees_all_close(
             *(jax.tree.map(lambda x: x[:, :1], s) for s in (mine, theirs)), **CLOSE
@@ -270,8 +270,8 @@ def test_jit_is_eager_and_an_environment_alone_is_one_among_others() -> None:
     params, given = parameters(), jax.tree.map(lambda x: x[:3], inputs())
     _, together = play(MODEL, params, start(params), given)
     with jax.disable_jit():
-        table = actor_critic.prepare(MODEL, params, WORDS)
-        _, eager = actor_critic.forward(MODEL, params, table, start(params), *given)
+        class_table = actor_critic.prepare(MODEL, params, WORDS)
+        _, eager = actor_critic.forward(MODEL, params, class_table, start(params), *given)
     chex.assert_trees_all_close(eager, together, **CLOSE)
     alone = [
         play(MODEL, params, start(params, 1), jax.tree.map(lambda x, b=b: x[:, b : b + 1], given))
@@ -281,7 +281,7 @@ def test_jit_is_eager_and_an_environment_alone_is_one_among_others() -> None:
     chex.assert_trees_all_close(stacked, together, **CLOSE)
 
 
-def test_stretches_begin_anew_with_a_rollout() -> None:
+def test_a_rollout_begins_a_new_interval() -> None:
     params, given = parameters(), inputs()
     memory, _ = play(MODEL, params, start(params), given)
     assert memory.phase.tolist() == [1] * B
@@ -303,7 +303,7 @@ def test_the_learned_loss_is_the_published_convolution() -> None:
 def test_the_update_sees_the_values_that_the_rollout_saw() -> None:
     targets = {"kitchen": ["Mug"], "bedroom": ["CD"]}
     parents = Parents(np.full((2, 3), -1, np.int32), np.zeros((2, 3), np.float32))
-    world = dynamics.make_params(house(), targets, parents, (5,) * 4, merge=False, image=True)
+    world = params.make_params(house(), targets, parents, (5,) * 4, merge=False, image=True)
     words = jnp.asarray(
         np.random.default_rng(0).normal(size=(len(house().classes), 4)), jnp.float32
     )
@@ -319,11 +319,11 @@ def test_the_update_sees_the_values_that_the_rollout_saw() -> None:
     after, steps, _ = jax.jit(learner.rollout, static_argnums=(2, 3))(
         state, jax.random.key(1), config, MODEL, words, world
     )
-    assert not jax.tree.leaves(steps.tape)
-    given = (steps.obs, steps.previous, steps.fresh, steps.keep)
-    table = actor_critic.prepare(MODEL, state.params, words)
+    assert not jax.tree.leaves(steps.cache)
+    given = (steps.obs, steps.prev_action_probs, steps.is_first, steps.dropout_mask)
+    class_table = actor_critic.prepare(MODEL, state.params, words)
     carry, out = actor_critic.forward(
-        MODEL, state.params, table, state.carry, *given, tape=steps.tape
+        MODEL, state.params, class_table, state.carry, *given, cache=steps.cache
     )
     np.testing.assert_allclose(out.value, steps.value, **CLOSE)
     chex.assert_trees_all_close(carry.hidden, after.carry.hidden, **CLOSE)
