@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 
 from tdanet_jax.config import LearnerConfig
+from tdanet_jax.env.params import make_params
 from tdanet_jax.env.reward import Parents
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output
 from tdanet_jax.models.baseline import BaselineEncoder
 from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic, AdaptiveState, LearnedLoss
 from tdanet_jax.models.shared.image import DROPOUT_UNITS
+from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.training import learner
 from tests.support import samples
 from tests.training.test_learner import house
@@ -250,19 +252,19 @@ def test_the_plain_network_is_the_one_that_adapts() -> None:
 
 def test_a_rollout_equals_its_steps_and_stores_the_same() -> None:
     params, given = parameters(), inputs()
-    memory, outs = start(params), []
+    state, outs = start(params), []
     for t in range(T):
-        memory, out = play(MODEL, params, memory, jax.tree.map(lambda x, t=t: x[t], given))
+        state, out = play(MODEL, params, state, jax.tree.map(lambda x, t=t: x[t], given))
         outs.append(out)
     last, whole = play(MODEL, params, start(params), given)
     chex.assert_trees_all_close(jax.tree.map(lambda *x: jnp.stack(x), *outs), whole, **CLOSE)
     # In an interval that is not full, the rest are steps of the interval before.
-    for mine, theirs in zip(memory.steps, last.steps, strict=True):
+    for mine, theirs in zip(state.steps, last.steps, strict=True):
         chex.assert_trees_all_close(
             *(jax.tree.map(lambda x: x[:, :1], s) for s in (mine, theirs)), **CLOSE
         )
-    chex.assert_trees_all_close(memory.replace(steps=0), last.replace(steps=0), **CLOSE)
-    assert memory.count.tolist() == [2, 1, 2]
+    chex.assert_trees_all_close(state.replace(steps=0), last.replace(steps=0), **CLOSE)
+    assert state.count.tolist() == [2, 1, 2]
 
 
 @pytest.mark.slow
@@ -283,9 +285,9 @@ def test_jit_is_eager_and_an_environment_alone_is_one_among_others() -> None:
 
 def test_a_rollout_begins_a_new_interval() -> None:
     params, given = parameters(), inputs()
-    memory, _ = play(MODEL, params, start(params), given)
-    assert memory.phase.tolist() == [1] * B
-    assert MODEL.begin_rollout(memory).phase.tolist() == [0] * B
+    state, _ = play(MODEL, params, start(params), given)
+    assert state.phase.tolist() == [1] * B
+    assert MODEL.begin_rollout(state).phase.tolist() == [0] * B
 
 
 def test_the_learned_loss_is_the_published_convolution() -> None:
@@ -303,7 +305,8 @@ def test_the_learned_loss_is_the_published_convolution() -> None:
 def test_the_update_sees_the_values_that_the_rollout_saw() -> None:
     targets = {"kitchen": ["Mug"], "bedroom": ["CD"]}
     parents = Parents(np.full((2, 3), -1, np.int32), np.zeros((2, 3), np.float32))
-    world = params.make_params(house(), targets, parents, (5,) * 4, merge=False, image=True)
+    spec = ObservationSpec(image="raster")
+    world = make_params(house(), targets, parents, (5,) * 4, spec)
     words = jnp.asarray(
         np.random.default_rng(0).normal(size=(len(house().classes), 4)), jnp.float32
     )
@@ -315,16 +318,21 @@ def test_the_update_sees_the_values_that_the_rollout_saw() -> None:
     for _ in range(2):
         state, _ = update(state, jnp.float32(0), config, MODEL, words, world)
     assert int(state.skipped) == 0
-    assert np.asarray(state.carry.count).any()
+    assert np.asarray(state.recurrent.carry.count).any()
     after, steps, _ = jax.jit(learner.rollout, static_argnums=(2, 3))(
         state, jax.random.key(1), config, MODEL, words, world
     )
-    assert not jax.tree.leaves(steps.cache)
+    assert not jax.tree.leaves(steps.activations)
     given = (steps.obs, steps.prev_action_probs, steps.is_first, steps.dropout_mask)
     class_table = actor_critic.prepare(MODEL, state.params, words)
     carry, out = actor_critic.forward(
-        MODEL, state.params, class_table, state.carry, *given, cache=steps.cache
+        MODEL,
+        state.params,
+        class_table,
+        state.recurrent.carry,
+        *given,
+        activations=steps.activations,
     )
     np.testing.assert_allclose(out.value, steps.value, **CLOSE)
-    chex.assert_trees_all_close(carry.hidden, after.carry.hidden, **CLOSE)
-    np.testing.assert_array_equal(carry.count, after.carry.count)
+    chex.assert_trees_all_close(carry.hidden, after.recurrent.carry.hidden, **CLOSE)
+    np.testing.assert_array_equal(carry.count, after.recurrent.carry.count)
