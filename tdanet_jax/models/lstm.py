@@ -84,7 +84,8 @@ class LSTM(nn.Module):
             return (hidden[-1], cell[-1]), hidden
 
         def body(carry: Carry, step: tuple) -> tuple[Carry, jax.Array]:
-            carry, _ = lstm_step(weights, carry, *step, self.dtype)
+            x, skip_inputs, is_first = step
+            carry, _ = lstm_step(weights, carry, x, skip_inputs, is_first, self.dtype)
             return carry, carry[0]
 
         return jax.lax.scan(body, carry, (x, skip_inputs, is_first))

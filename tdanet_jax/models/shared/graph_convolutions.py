@@ -114,12 +114,15 @@ def _convolve_bwd(
     dtype: Any, saved: tuple[Convolutions, jax.Array], cotangent: jax.Array
 ) -> tuple[Convolutions, jax.Array, None]:
     weights, shared = saved
-    transposed = [materialized_transpose(w, dtype) for w in (weights.adjacency, weights.second)]
+    transposed = (
+        materialized_transpose(weights.adjacency, dtype),
+        materialized_transpose(weights.second, dtype),
+    )
 
     def body(
         total: Convolutions, step: tuple[jax.Array, jax.Array]
     ) -> tuple[Convolutions, jax.Array]:
-        grads, grad_shared = gradient(weights, *transposed, *step, dtype)
+        grads, grad_shared = gradient(weights, transposed, *step, dtype)
         return jax.tree.map(jnp.add, total, grads), grad_shared
 
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape), weights)
@@ -134,8 +137,7 @@ convolve.defvjp(_convolve_fwd, _convolve_bwd)
 
 def gradient(
     weights: Convolutions,
-    adjacency_transposed: jax.Array,
-    second_transposed: jax.Array,
+    transposed: tuple[jax.Array, jax.Array],
     shared: jax.Array,
     cotangent: jax.Array,
     dtype: Any,
@@ -144,8 +146,7 @@ def gradient(
 
     Args:
       weights: of the layers.
-      adjacency_transposed: A transposed and materialized.
-      second_transposed: W1 transposed and materialized.
+      transposed: A and W1 transposed and materialized.
       shared: [B, h].
       cotangent: [B, n, u].
       dtype: operands of the large products.
@@ -158,10 +159,10 @@ def gradient(
     second = lower @ weights.third.astype(jnp.float32).T
     second = jnp.where(at.second.reshape(-1, width) > 0, second, 0.0).astype(dtype)
     second = second.reshape(count, -1)
-    mixed = product(adjacency_transposed, second, dtype).astype(dtype).reshape(-1, width)
+    mixed = product(transposed[0], second, dtype).astype(dtype).reshape(-1, width)
     # The first layer's transpose is computed anew, unit by unit: large transposes are slow.
     turned = shared.T[:, None] * weights.degree[:, None] + weights.words.T[..., None]
-    first = product(mixed, second_transposed, dtype).reshape(at.first.shape)
+    first = product(mixed, transposed[1], dtype).reshape(at.first.shape)
     first = jnp.where(at.first > 0, first, 0.0)
     adjacency = product(second, at.mixed.reshape(count, -1).T, dtype)
     grads = Convolutions(
