@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tdanet_jax.io import files
-from tdanet_jax.models.registry import MODELS
-from tdanet_jax.observation_spec import SENSORS, ObservationSpec
+from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.registry import MODELS, SENSORS
 from tdanet_jax.splits import file_name, make_split, split_name
 
 #: Budget in environment steps where none is given.

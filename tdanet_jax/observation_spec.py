@@ -6,14 +6,9 @@ Imports no JAX, so that a configuration can be checked before anything heavy is 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Literal
 
-#: Sensors by name, and the module that makes each. Custom ones go by their modules' dotted names.
-SENSORS: Mapping[str, str] = {
-    "odometry": "tdanet_jax.sensors.odometry",
-    "triangulation": "tdanet_jax.sensors.triangulation",
-}
+from tdanet_jax.registry import SENSORS
 
 
 @dataclasses.dataclass(frozen=True)

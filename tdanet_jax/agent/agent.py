@@ -24,7 +24,7 @@ from tdanet_jax.models import actor_critic
 from tdanet_jax.models import classes as vocabularies
 from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
 from tdanet_jax.models.classes import ClassVocabulary
-from tdanet_jax.models.registry import make_model
+from tdanet_jax.models.factory import make_model
 from tdanet_jax.poses import ROTATIONS
 from tdanet_jax.sensors import suite
 from tdanet_jax.sensors.detections import centre_and_area, merge_classes

@@ -10,7 +10,7 @@ from typing import Any
 from tdanet_jax.evaluation import comparison, paper
 from tdanet_jax.evaluation.comparison import Curve, Result, Spread
 from tdanet_jax.evaluation.sweep import Finished, evaluated_history, labels
-from tdanet_jax.models.registry import MODELS
+from tdanet_jax.registry import MODELS
 from tdanet_jax.splits import UNSEEN
 
 REPORT_VERSION = 1

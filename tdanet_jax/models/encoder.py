@@ -2,7 +2,7 @@
 
 A model is one file, here or anywhere that Python finds it. It defines an `Encoder` and a function
 `make(config, classes, dtype) -> ActorCritic`. `--model` takes its dotted name; those in this folder
-have short ones, in `tdanet_jax.models.registry.MODELS`. The environment, the update, the evaluation
+have short ones, in `tdanet_jax.registry.MODELS`. The environment, the update, the evaluation
 and every command then work with it.
 """
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary
-from tdanet_jax.models.registry import make_model
+from tdanet_jax.models.factory import make_model
 
 #: The unit of the papers' tables.
 UNIT = 2**20

@@ -1,9 +1,9 @@
 """The interface of a sensor: what an agent perceives in addition to its detections.
 
 A sensor is one file with a function `make() -> Sensor`, here or anywhere that Python finds it.
-`observation_spec.SENSORS` gives the built-in ones short names; `--sensors` takes the dotted name of
-any other. The environment and an agent on a robot run the same functions, so a sensor is told only
-what a robot knows: how it faces at the start, its own actions, whether it was blocked, and its
+`tdanet_jax.registry.SENSORS` gives the built-in ones short names; `--sensors` takes the dotted name
+of any other. The environment and an agent on a robot run the same functions, so a sensor is told
+only what a robot knows: how it faces at the start, its own actions, whether it was blocked, and its
 detections. All methods work on one episode, and under `jit` and `vmap`.
 """
 

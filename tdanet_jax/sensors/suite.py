@@ -7,14 +7,14 @@ and `blank` work on one episode.
 from __future__ import annotations
 
 import functools
-import importlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from tdanet_jax.observation_spec import SENSORS, ObservationSpec
+from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.registry import SENSORS, find_make
 from tdanet_jax.sensors.sensor import Frame, Motion, Sensor, Start
 
 #: States or readings by sensor name.
@@ -31,13 +31,9 @@ def make(spec: ObservationSpec) -> dict[str, Sensor]:
     """
     out: dict[str, Sensor] = {}
     for name in spec.sensors:
-        try:
-            module = importlib.import_module(SENSORS.get(name, name))
-        except (ImportError, TypeError) as error:  # TypeError: a name that begins with a dot
-            raise ValueError(f"--sensors {name}: {error}") from None
-        sensor = module.make() if hasattr(module, "make") else None
+        sensor = find_make("--sensors", name, SENSORS.get(name, name))()
         if not isinstance(sensor, Sensor):
-            raise ValueError(f"--sensors {name}: the module has no function `make` -> Sensor")
+            raise ValueError(f"--sensors {name}: `make` gives no Sensor")
         for missing in (required for required in sensor.REQUIRES if required not in out):
             raise ValueError(f"--sensors {name}: needs {missing} before it")
         out[name] = sensor

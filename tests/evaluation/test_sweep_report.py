@@ -6,7 +6,7 @@ import json
 import pytest
 
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.models.registry import MODELS
+from tdanet_jax.registry import MODELS
 from tdanet_jax.evaluation import sweep, sweep_report
 from tdanet_jax.evaluation.comparison import curve
 from tdanet_jax.evaluation.sweep_report import Cost, Report

@@ -7,7 +7,8 @@ import pytest
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.models import parameter_count
 from tdanet_jax.models.classes import ClassVocabulary
-from tdanet_jax.models.registry import MODELS, make_model
+from tdanet_jax.models.factory import make_model
+from tdanet_jax.registry import MODELS
 
 NAMES = tuple(f"Class{i}" for i in range(9))
 

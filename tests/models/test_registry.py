@@ -18,8 +18,9 @@ from tdanet_jax.env.types import Observation
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import SENSOR_UNITS, ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary
-from tdanet_jax.models.registry import MODELS, make_model
+from tdanet_jax.models.factory import make_model
 from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.registry import MODELS
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.task import make_task
 from tdanet_jax.training import learner

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from tdanet_jax.models.registry import MODELS
+from tdanet_jax.registry import MODELS
 from tests.system import gpu
 
 #: Doubles three numbers in each of five turns of a loop, as XLA prints it.

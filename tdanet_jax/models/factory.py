@@ -1,36 +1,18 @@
-"""Models by name, and the network that a configuration describes.
-
-Imports no JAX until a network is made, so that a configuration can check names.
-"""
+"""The network that a configuration describes."""
 
 from __future__ import annotations
 
 import dataclasses
-import importlib
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from tdanet_jax.config import NetworkConfig, TrainConfig
-    from tdanet_jax.models.actor_critic import ActorCritic
-    from tdanet_jax.models.classes import ClassVocabulary
+import jax
+import jax.numpy as jnp
 
-#: Models by name: the module that makes each, and the settings that it is made with.
-MODELS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "tdanet": ("tdanet_jax.models.tdanet", {}),
-    "tdanet-no-ta": ("tdanet_jax.models.tdanet", {"target_attention": False}),
-    "tdanet-no-sa": ("tdanet_jax.models.tdanet", {"siamese": False}),
-    "tdanet-no-ta-sa": ("tdanet_jax.models.tdanet", {"target_attention": False, "siamese": False}),
-    "ssnet": ("tdanet_jax.models.ssnet", {}),
-    "mjolnir-o": ("tdanet_jax.models.mjolnir", {}),
-    "mjolnir-r": ("tdanet_jax.models.mjolnir", {"image": True}),
-    "baseline": ("tdanet_jax.models.baseline", {}),
-    "sp": ("tdanet_jax.models.sp", {"width": 256}),
-    "sp-wide": ("tdanet_jax.models.sp", {"width": 1024}),
-    "savn": ("tdanet_jax.models.savn", {}),
-    "li": ("tdanet_jax.models.li", {}),
-}
+from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.classes import ClassVocabulary
+from tdanet_jax.registry import MODELS, find_make
 
 
 def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
@@ -44,20 +26,10 @@ def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
       ValueError: `config.model` names a module that cannot be imported or makes no `ActorCritic`,
         or the model is not shown what a sensor needs.
     """
-    import jax.numpy as jnp
-
-    from tdanet_jax.models.actor_critic import ActorCritic
-
-    module_name, options = MODELS.get(config.model, (config.model, {}))
-    try:
-        module = importlib.import_module(module_name)
-    except (ImportError, TypeError) as error:  # TypeError: a name that begins with a dot
-        raise ValueError(f"--model {config.model}: {error}") from None
-    if not hasattr(module, "make"):
-        raise ValueError(f"--model {config.model}: the module has no function `make`")
+    module, options = MODELS.get(config.model, (config.model, {}))
     network = config.network
     dtype = jnp.dtype(resolve_precision(network).precision)
-    model = module.make(network, classes, dtype, **options)
+    model = find_make("--model", config.model, module)(network, classes, dtype, **options)
     if not isinstance(model, ActorCritic):
         raise ValueError(f"--model {config.model}: `make` gives no ActorCritic")
     encoder, asked = model.encoder, network.spec
@@ -73,8 +45,6 @@ def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
 
 def resolve_precision(config: NetworkConfig) -> NetworkConfig:
     """The configuration with `precision` "auto" replaced by what is fastest on this machine."""
-    import jax
-
     if config.precision != "auto":
         return config
     cpuinfo = Path("/proc/cpuinfo")
@@ -86,7 +56,7 @@ def resolve_precision(config: NetworkConfig) -> NetworkConfig:
 
 def unused_flags(config: TrainConfig, classes: ClassVocabulary) -> list[str]:
     """The network's flags that are set but change nothing for this model, if it is not custom."""
-    network, default = config.network, type(config.network)()
+    network, default = config.network, NetworkConfig()
     if config.model not in MODELS:
         return []
     model = make_model(config, classes)
