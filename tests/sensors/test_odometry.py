@@ -1,4 +1,4 @@
-"""Dead reckoning and the map of the way: a slow trail of sets and degrees, and the rooms' truth."""
+"""Dead reckoning and the map: a slow odometry of sets and degrees, and the rooms' truth."""
 
 from __future__ import annotations
 
@@ -16,12 +16,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tdanet_jax.env import dynamics
-from tdanet_jax.env.dynamics import EnvParams, EnvState, Observation
+from tdanet_jax.env.params import make_params
 from tdanet_jax.env.reward import no_parents
+from tdanet_jax.env.types import EnvParams, EnvState, Observation
+from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.scenes.tables import build
-from tdanet_jax.sensors import odometry
-from tdanet_jax.sensors.odometry import Odometry, Trail
+from tdanet_jax.sensors import suite
+from tdanet_jax.sensors.odometry import Odometry, OdometryReading, OdometryState
+from tdanet_jax.sensors.sensor import Motion, Start
 from tests.support import toy
 from tests.support.oracle import (
     DONE,
@@ -47,10 +50,11 @@ BLOCKED = 256
 AHEAD = [(MOVE_AHEAD, False)]
 Walk = Sequence[tuple[int, bool]]  # actions, and whether the agent did not move
 LONGEST = 120
+SENSOR = Odometry()
 
 
-class SlowTrail:
-    """The way of one episode, in degrees, tuples and sets."""
+class SlowOdometry:
+    """The agent's pose and map in one episode, in degrees, tuples and sets."""
 
     def __init__(self, diagonal: bool, horizon: int) -> None:
         self.x = self.z = 0
@@ -61,8 +65,8 @@ class SlowTrail:
         self.stood = {(0, 0, self.heading)}
         self.in_the_way: set[tuple[int, int]] = set()
 
-    def follow(self, action: int, did_not_move: bool) -> None:
-        """An action, and whether it moved the agent."""
+    def update(self, action: int, did_not_move: bool) -> None:
+        """An action, and whether it failed to move the agent."""
         east, north = STEPS[self.heading]
         self.action, self.was_blocked = action, action == MOVE_AHEAD and did_not_move
         if self.was_blocked:
@@ -107,20 +111,27 @@ class SlowTrail:
         return rows
 
 
+def begun(rotation: Any, horizon: Any) -> OdometryState:
+    """The state at the start of an episode."""
+    return SENSOR.init(Start(jnp.int32(rotation), jnp.int32(horizon)))
+
+
 @functools.partial(jax.jit, static_argnames="map_too")
 def walked(
     diagonal: Any, horizon: Any, actions: Any, blocked: Any, map_too: bool = False
-) -> tuple[Trail, tuple[Trail, Odometry]]:
-    """The last trail of a walk [N], and trail and senses at its start and after every action."""
+) -> tuple[OdometryState, tuple[OdometryState, OdometryReading]]:
+    """The last state of a walk [N], and states and readings, at its start and after each action."""
 
-    def step(trail: Trail, given: tuple) -> tuple[Trail, tuple[Trail, Odometry]]:
-        trail = odometry.follow(trail, *given)
-        kept = trail if map_too else trail.replace(cells=jnp.zeros(0))
-        return trail, (kept, odometry.sense(trail))
+    def step(
+        state: OdometryState, given: tuple
+    ) -> tuple[OdometryState, tuple[OdometryState, OdometryReading]]:
+        state = SENSOR.update(state, Motion(*given), {})
+        kept = state if map_too else state.replace(cells=jnp.zeros(0))
+        return state, (kept, SENSOR.read(state, {}))
 
-    begun = odometry.begin(jnp.int32(diagonal), jnp.int32(horizon))
     actions = jnp.concatenate([jnp.array([NOTHING]), actions])
-    return jax.lax.scan(step, begun, (actions, jnp.append(True, blocked)))
+    given = (actions, jnp.append(True, blocked))
+    return jax.lax.scan(step, begun(diagonal, horizon), given)
 
 
 def columns(walk: Walk) -> tuple[np.ndarray, np.ndarray]:
@@ -140,17 +151,17 @@ RUNS = st.lists(
 
 @settings(max_examples=40)
 @given(diagonal=st.booleans(), horizon=st.integers(0, 1), runs=RUNS)
-def test_every_step_is_that_of_the_slow_trail(diagonal: bool, horizon: int, runs: list) -> None:
+def test_every_step_is_that_of_the_slow_odometry(diagonal: bool, horizon: int, runs: list) -> None:
     walk = [(action, blocked) for action, blocked, times in runs for _ in range(times)][:LONGEST]
     last, found = walked(diagonal, horizon, *columns(walk))
-    trail, seen = jax.device_get(found)
-    slow = SlowTrail(diagonal, horizon)
+    state, seen = jax.device_get(found)
+    slow = SlowOdometry(diagonal, horizon)
     for t in range(len(walk) + 1):
         if t:
-            slow.follow(*walk[t - 1])
-        assert trail.cell[t].tolist() == [slow.x, slow.z]
-        assert (45 * trail.heading[t], trail.horizon[t]) == (slow.heading, slow.horizon)
-        assert (trail.action[t], trail.blocked[t]) == (slow.action, slow.was_blocked)
+            slow.update(*walk[t - 1])
+        assert state.cell[t].tolist() == [slow.x, slow.z]
+        assert (45 * state.heading[t], state.horizon[t]) == (slow.heading, slow.horizon)
+        assert (state.action[t], state.blocked[t]) == (slow.action, slow.was_blocked)
         np.testing.assert_allclose(seen.motion[t], slow.motion(), atol=2e-6)
         np.testing.assert_array_equal(seen.window[t], slow.window())
     assert last.cells.shape == (64, 64)
@@ -163,12 +174,12 @@ def wandering(seed: int, length: int) -> tuple[np.ndarray, np.ndarray]:
     return actions.astype(np.int32), rng.random(length) < 0.3
 
 
-def test_the_map_holds_the_whole_way_and_nothing_else() -> None:
+def test_the_map_holds_the_whole_path_and_nothing_else() -> None:
     actions, blocked = wandering(0, LONGEST)
     last, _ = walked(1, 0, actions, blocked)
-    slow = SlowTrail(diagonal=True, horizon=0)
+    slow = SlowOdometry(diagonal=True, horizon=0)
     for action, flag in zip(actions, blocked, strict=True):
-        slow.follow(int(action), bool(flag))
+        slow.update(int(action), bool(flag))
     cells = np.zeros((64, 64), int)
     for x, z, heading in slow.stood:
         cells[x, z] += 1 << heading // 45
@@ -180,10 +191,10 @@ def test_the_map_holds_the_whole_way_and_nothing_else() -> None:
 
 @pytest.mark.parametrize("diagonal", [False, True])
 def test_beyond_64_cells_the_map_begins_anew_and_the_position_does_not(diagonal: bool) -> None:
-    _, (trail, seen) = walked(diagonal, 0, *columns([(MOVE_AHEAD, True), *66 * AHEAD]))
-    # After 62 steps the start is two cells ahead, and behind it comes the way that it went; what
+    _, (state, seen) = walked(diagonal, 0, *columns([(MOVE_AHEAD, True), *66 * AHEAD]))
+    # After 62 steps the start is two cells ahead, and beyond it lies the path that it took; what
     # was in the way there is three cells ahead. Diagonal cells are as far as 1.4 rows.
-    assert trail.cell[63].tolist() == [62 * diagonal, 62]
+    assert state.cell[63].tolist() == [62 * diagonal, 62]
     assert [row for row in range(4) if seen.window[63, row, 4] & 1] == (
         [0, 1] if diagonal else [0, 1, 2]
     )
@@ -191,7 +202,7 @@ def test_beyond_64_cells_the_map_begins_anew_and_the_position_does_not(diagonal:
     away = 62 / 16 * (math.sqrt(2) if diagonal else 1)
     np.testing.assert_allclose(seen.motion[63, :2], [0, away], atol=1e-5)
     # After 64 it stands on the start, as far as the map goes.
-    assert trail.cell[65].tolist() == [64 * diagonal, 64]
+    assert state.cell[65].tolist() == [64 * diagonal, 64]
     assert seen.window[65][FRONT] & BLOCKED
 
 
@@ -204,10 +215,10 @@ def test_compiled_is_eager_and_many_are_one_by_one() -> None:
     together = jax.vmap(functools.partial(walked, map_too=True))(*given)
     close = {"rtol": 1e-6, "atol": 1e-6}  # sines and cosines may be computed in another way
     chex.assert_trees_all_close(together, stacked, **close)
-    trail = odometry.begin(jnp.int32(1), jnp.int32(1))
+    state = begun(1, 1)
     for t, (action, flag) in enumerate(zip(*walks[1], strict=True), start=1):
-        trail = odometry.follow(trail, jnp.int32(action), jnp.asarray(flag))
-        eager = trail, odometry.sense(trail)
+        state = SENSOR.update(state, Motion(jnp.int32(action), jnp.asarray(flag)), {})
+        eager = state, SENSOR.read(state, {})
         compiled = jax.tree.map(lambda x, t=t: x[t], alone[1][1])
         chex.assert_trees_all_close(eager, compiled, **close)
         chex.assert_trees_all_equal_dtypes(eager, compiled)
@@ -216,13 +227,27 @@ def test_compiled_is_eager_and_many_are_one_by_one() -> None:
 @pytest.mark.parametrize("diagonal", [0, 1])
 @pytest.mark.parametrize("blocked", [False, True])
 def test_no_action_yet_changes_nothing(diagonal: int, blocked: bool) -> None:
-    begun = odometry.begin(jnp.int32(diagonal), jnp.int32(1))
-    after = odometry.follow(begun, jnp.int32(NOTHING), jnp.asarray(blocked))
-    chex.assert_trees_all_equal(after, begun)
-    chex.assert_trees_all_equal_dtypes(after, begun)
+    before = begun(diagonal, 1)
+    after = SENSOR.update(before, Motion(jnp.int32(NOTHING), jnp.asarray(blocked)), {})
+    chex.assert_trees_all_equal(after, before)
+    chex.assert_trees_all_equal_dtypes(after, before)
 
 
-def test_a_start_along_a_diagonal_senses_the_same_as_one_along_an_axis() -> None:
+@pytest.mark.parametrize("rotation", range(8))
+def test_of_the_rotation_at_the_start_only_whether_it_is_along_a_diagonal_matters(
+    rotation: int,
+) -> None:
+    chex.assert_trees_all_equal(begun(rotation, 1), begun(rotation % 2, 1))
+    assert int(begun(rotation, 1).heading) == rotation % 2
+
+
+def test_another_target_does_not_clear_the_map() -> None:
+    state, _ = walked(0, 0, *columns(AHEAD))
+    for changed in (False, True):
+        chex.assert_trees_all_equal(SENSOR.clear(state, jnp.asarray(changed)), state)
+
+
+def test_a_start_along_a_diagonal_reads_the_same_as_one_along_an_axis() -> None:
     seen = [walked(d, 0, *columns([]))[1][1] for d in (0, 1)]
     seen = [jax.tree.map(lambda x: x[0], found) for found in seen]
     for start, turned in zip(seen, (0, math.sqrt(0.5)), strict=True):
@@ -231,7 +256,7 @@ def test_a_start_along_a_diagonal_senses_the_same_as_one_along_an_axis() -> None
         np.testing.assert_array_equal(start.window, expected)
         motion = [0, 0, turned, math.sqrt(1 - turned**2), *[0] * 8]
         np.testing.assert_allclose(start.motion, motion, atol=1e-6)
-    batch = jax.jit(odometry.sensed_at_start, static_argnums=(0, 1))(3, False)
+    batch = suite.blank(ObservationSpec(sensors=("odometry",)), 3)["odometry"]
     for row in range(3):
         chex.assert_trees_all_close(jax.tree.map(lambda x, r=row: x[r], batch), seen[0])
 
@@ -239,7 +264,7 @@ def test_a_start_along_a_diagonal_senses_the_same_as_one_along_an_axis() -> None
 @pytest.mark.parametrize("turns", range(8))
 def test_move_ahead_leads_to_the_cell_in_front_of_the_middle(turns: int) -> None:
     walk = [*[(ROTATE_RIGHT, False)] * turns, (MOVE_AHEAD, True), *AHEAD]
-    _, (trail, seen) = walked(0, 0, *columns(walk))
+    _, (state, seen) = walked(0, 0, *columns(walk))
     turned, stopped, moved = (np.asarray(seen.window[turns + i]) for i in range(3))
     assert not (turned & BLOCKED).any()
     assert stopped[FRONT] == BLOCKED
@@ -247,12 +272,12 @@ def test_move_ahead_leads_to_the_cell_in_front_of_the_middle(turns: int) -> None
     assert set(zip(*np.nonzero(stopped & BLOCKED), strict=True)) <= {FRONT, (2, 4)}
     assert stopped[MIDDLE] == turned[MIDDLE]
     assert stopped[MIDDLE] & 1
-    # And there it leads: the cell that was in front is the middle, and the old middle behind it.
+    # And there it leads: the cell that was in front is the middle, and the old middle is behind it.
     assert moved[MIDDLE] == BLOCKED | 1
     assert moved[BEHIND] == stopped[MIDDLE]
     assert moved[FRONT] == 0 or turns % 2
     east, north = STEPS[HEADINGS[turns]]
-    assert trail.cell[turns + 2].tolist() == [east, north]
+    assert state.cell[turns + 2].tolist() == [east, north]
 
 
 def test_headings_in_the_window_are_relative_to_ones_own() -> None:
@@ -262,12 +287,13 @@ def test_headings_in_the_window_are_relative_to_ones_own() -> None:
     assert seen.window[:4, *MIDDLE].tolist() == [1, 1 | 1 << 7, 1 | 3 << 6, 1 | 7 << 5]
 
 
-def test_all_numbers_are_the_motion_and_the_windows_bits_cell_by_cell() -> None:
+def test_the_features_are_the_motion_and_the_windows_bits_cell_by_cell() -> None:
     rng = np.random.default_rng(0)
     motion = rng.normal(size=(2, 3, 12)).astype(np.float32)
     window = rng.integers(0, 512, (2, 3, 9, 9)).astype(np.uint16)
-    found = odometry.numbers(Odometry(jnp.asarray(motion), jnp.asarray(window)))
+    found = SENSOR.features(OdometryReading(jnp.asarray(motion), jnp.asarray(window)))
     assert found.shape == (2, 3, 12 + 9 * 9 * 9)
+    assert SENSOR.width == found.shape[-1]
     assert found.dtype == jnp.float32
     np.testing.assert_array_equal(found[..., :12], motion)
     expected = [window[..., r, c] >> b & 1 for r in range(9) for c in range(9) for b in range(9)]
@@ -277,30 +303,29 @@ def test_all_numbers_are_the_motion_and_the_windows_bits_cell_by_cell() -> None:
 # In the environment
 
 
-def params_of(tables: SceneTables, senses: bool, limits: Sequence[int] = (1000,) * 4) -> EnvParams:
+def params_of(tables: SceneTables, sensors: bool, limits: Sequence[int] = (1000,) * 4) -> EnvParams:
     """Episodes for every target in every room."""
     targets = dict.fromkeys(ROOMS, tables.targets)
-    return dynamics.make_params(
-        tables, targets, no_parents(tables), limits, merge=False, odometry=senses
-    )
+    spec = ObservationSpec(sensors=("odometry",) if sensors else ())
+    return make_params(tables, targets, no_parents(tables), limits, spec)
 
 
 @jax.jit
 def played(params: EnvParams, pose: jax.Array, actions: jax.Array) -> tuple[EnvState, Observation]:
     """States and observations [N + 1, B] at the start of episodes and after each action [N, B]."""
 
-    def look(state: EnvState) -> tuple[EnvState, Observation]:
+    def shown(state: EnvState) -> tuple[EnvState, Observation]:
         obs = jax.vmap(dynamics.observe, (0, None))(state, params)
-        trail = None if state.trail is None else state.trail.replace(cells=jnp.zeros(0))
-        return state.replace(trail=trail), obs
+        kept = {name: one.replace(cells=jnp.zeros(0)) for name, one in state.sensors.items()}
+        return state.replace(sensors=kept), obs
 
     def step(state: EnvState, action: jax.Array) -> tuple[EnvState, Any]:
         state = jax.vmap(dynamics.transition, (0, 0, None))(state, action, params).state
-        return state, look(state)
+        return state, shown(state)
 
-    start = jax.vmap(dynamics.start, (None, 0, None))(params, pose, jnp.int32(0))
+    start = jax.vmap(dynamics.start, (0, None, None))(pose, jnp.int32(0), params)
     _, after = jax.lax.scan(step, start, actions)
-    return jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), look(start), after)
+    return jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), shown(start), after)
 
 
 @functools.cache
@@ -331,58 +356,58 @@ def random_episodes(
 
 def test_dead_reckoning_is_the_true_displacement(tables: SceneTables) -> None:
     pose, actions = random_episodes(tables)
-    state, obs = jax.device_get(played(params_of(tables, senses=True), pose, actions))
+    state, obs = jax.device_get(played(params_of(tables, sensors=True), pose, actions))
+    known, seen = state.sensors["odometry"], obs.sensors["odometry"]
     farthest, stopped = 0.0, 0
     for b in range(len(pose)):
         start = pose_of(int(pose[b]))
         frame = start.heading // 90 * 90  # of a start along a diagonal, the axis to its left
         sine, cosine = (round(f(math.radians(frame))) for f in (math.sin, math.cos))
-        slow = SlowTrail(start.heading != frame, start.horizon // 30)
+        slow = SlowOdometry(start.heading != frame, start.horizon // 30)
         for t in range(len(actions) + 1):
             now = pose_of(int(state.pose[t, b]))
             if t:
                 stays = state.pose[t, b] == state.pose[t - 1, b]
-                slow.follow(int(actions[t - 1, b]), bool(stays))
+                slow.update(int(actions[t - 1, b]), bool(stays))
                 ahead = actions[t - 1, b] == MOVE_AHEAD
                 stopped += ahead and stays
-                assert state.trail.blocked[t, b] == (ahead and stays)
+                assert known.blocked[t, b] == (ahead and stays)
                 if ahead:
-                    assert bool(obs.odometry.window[t, b][FRONT] & BLOCKED) >= stays
+                    assert bool(seen.window[t, b][FRONT] & BLOCKED) >= stays
             x, _, z = (tables.position[now.position] - tables.position[start.position]) / 0.25
             truth = x * cosine - z * sine, x * sine + z * cosine
-            np.testing.assert_allclose(state.trail.cell[t, b], truth, atol=1e-3)
-            assert (45 * state.trail.heading[t, b] + frame) % 360 == now.heading
-            assert 30 * state.trail.horizon[t, b] == now.horizon
+            np.testing.assert_allclose(known.cell[t, b], truth, atol=1e-3)
+            assert (45 * known.heading[t, b] + frame) % 360 == now.heading
+            assert 30 * known.horizon[t, b] == now.horizon
             farthest = max(farthest, *map(abs, truth))
             if b % 8 == 5 and t % 5 == 0:  # the slow window takes its time
-                np.testing.assert_array_equal(obs.odometry.window[t, b], slow.window())
-        np.testing.assert_allclose(obs.odometry.motion[-1, b], slow.motion(), atol=2e-6)
+                np.testing.assert_array_equal(seen.window[t, b], slow.window())
+        np.testing.assert_allclose(seen.motion[-1, b], slow.motion(), atol=2e-6)
     # A point is reachable or it is not: nobody ever stood where something was in the way.
-    window = obs.odometry.window
+    window = seen.window
     assert not ((window & BLOCKED > 0) & (window & (BLOCKED - 1) > 0)).any()
     assert farthest > (8 if len(tables.position) > 500 else 4)
     assert stopped > 500
 
 
-def test_without_odometry_all_is_as_it_was(some_rooms: SceneTables) -> None:
+def test_without_odometry_everything_else_is_the_same(some_rooms: SceneTables) -> None:
     pose, actions = random_episodes(some_rooms, batch=8, steps=20)
-    state, obs = played(params_of(some_rooms, senses=False), pose, actions)
-    assert state.trail is obs.odometry is None
-    sensing, more = played(params_of(some_rooms, senses=True), pose, actions)
-    assert sensing.trail is not None
-    assert more.odometry is not None
-    chex.assert_trees_all_equal(sensing.replace(trail=None), state)
-    chex.assert_trees_all_equal(more.replace(odometry=None), obs)
+    state, obs = played(params_of(some_rooms, sensors=False), pose, actions)
+    assert state.sensors == obs.sensors == {}
+    sensing, more = played(params_of(some_rooms, sensors=True), pose, actions)
+    assert list(sensing.sensors) == list(more.sensors) == ["odometry"]
+    chex.assert_trees_all_equal(sensing.replace(sensors={}), state)
+    chex.assert_trees_all_equal(more.replace(sensors={}), obs)
 
 
-def test_an_automatic_reset_begins_a_new_trail() -> None:
-    params = params_of(toy_rooms(), senses=True, limits=(7,) * 4)
+def test_an_automatic_reset_begins_a_new_map() -> None:
+    params = params_of(toy_rooms(), sensors=True, limits=(7,) * 4)
     reset, step = (jax.jit(jax.vmap(f, axes)) for f, axes in (
         (dynamics.reset, (0, None)), (dynamics.step, (0, 0, 0, None)),
     ))  # fmt: skip
     batch, rng = 32, np.random.default_rng(4)
     obs, state = reset(jax.random.split(jax.random.key(0), batch), params)
-    slow = [begun(state, b) for b in range(batch)]
+    slow = [slow_start(state, b) for b in range(batch)]
     ends = {"done": 0, "time-out": 0, "diagonal": 0}
     for t in range(25):
         actions = rng.choice(6, batch, p=[0.5, 0.1, 0.2, 0.05, 0.05, 0.1])
@@ -390,32 +415,33 @@ def test_an_automatic_reset_begins_a_new_trail() -> None:
         before = state
         obs, state, _, terminated, truncated, info = step(keys, state, actions, params)
         final = jax.device_get(info["final_state"])
+        last, seen = final.sensors["odometry"], obs.sensors["odometry"]
         for b in range(batch):
-            slow[b].follow(int(actions[b]), bool(final.pose[b] == before.pose[b]))
-            assert final.trail.cell[b].tolist() == [slow[b].x, slow[b].z]
-            assert final.trail.action[b] == actions[b]
+            slow[b].update(int(actions[b]), bool(final.pose[b] == before.pose[b]))
+            assert last.cell[b].tolist() == [slow[b].x, slow[b].z]
+            assert last.action[b] == actions[b]
             if terminated[b] or truncated[b]:
                 assert terminated[b] == (actions[b] == DONE)
                 ends["done" if terminated[b] else "time-out"] += 1
-                slow[b] = begun(state, b)
+                slow[b] = slow_start(state, b)
                 ends["diagonal"] += slow[b].heading
-                fresh = odometry.begin(jnp.int32(slow[b].heading // 45), jnp.int32(0))
-                chex.assert_trees_all_equal(jax.tree.map(lambda x, b=b: x[b], state.trail), fresh)
-            np.testing.assert_array_equal(obs.odometry.window[b], slow[b].window())
-            np.testing.assert_allclose(obs.odometry.motion[b], slow[b].motion(), atol=2e-6)
+                now = jax.tree.map(lambda x, b=b: x[b], state.sensors["odometry"])
+                chex.assert_trees_all_equal(now, begun(slow[b].heading // 45, 0))
+            np.testing.assert_array_equal(seen.window[b], slow[b].window())
+            np.testing.assert_allclose(seen.motion[b], slow[b].motion(), atol=2e-6)
     assert min(ends.values()) > 10
 
 
-def begun(state: EnvState, b: int) -> SlowTrail:
-    """The slow trail at the start of the state's episode b."""
+def slow_start(state: EnvState, b: int) -> SlowOdometry:
+    """The slow odometry at the start of the state's episode b."""
     pose = pose_of(int(state.pose[b]))
-    return SlowTrail(pose.heading % 90 != 0, pose.horizon // 30)
+    return SlowOdometry(pose.heading % 90 != 0, pose.horizon // 30)
 
 
-def test_choosing_episodes_chooses_their_trails() -> None:
-    params = params_of(toy_rooms(), senses=True)
+def test_choosing_episodes_chooses_their_maps() -> None:
+    params = params_of(toy_rooms(), sensors=True)
     states = [
-        jax.vmap(dynamics.start, (None, 0, None))(params, poses, jnp.int32(0))
+        jax.vmap(dynamics.start, (0, None, None))(poses, jnp.int32(0), params)
         for poses in (jnp.arange(0, 8), jnp.arange(16, 24))
     ]
     chosen = jnp.arange(8) % 3 == 0

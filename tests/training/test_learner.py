@@ -15,12 +15,14 @@ import pytest
 
 from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import dynamics
-from tdanet_jax.env.dynamics import EnvParams
+from tdanet_jax.env.params import make_params
 from tdanet_jax.env.reward import Parents
+from tdanet_jax.env.types import EnvParams
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output
-from tdanet_jax.models.layers import Carry
+from tdanet_jax.models.lstm import Carry
 from tdanet_jax.models.tdanet import TDANetEncoder
+from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.training import learner
 from tdanet_jax.training.gae import advantages
 from tdanet_jax.training.learner import Rollout, TrainState
@@ -63,29 +65,28 @@ CONFIG = LearnerConfig(
 )
 
 
-def house_params() -> EnvParams:
+def house_params(spec: ObservationSpec) -> EnvParams:
     classes = np.full((2, 3), -1, np.int32)
     reward = np.zeros((2, 3), np.float32)
     for goal, target in enumerate(TABLES.targets):
         for slot, (name, worth) in enumerate(WORTH[target].items()):
             classes[goal, slot], reward[goal, slot] = CLASSES.index(name), worth
     targets = {"kitchen": ["Mug"], "bedroom": ["CD"]}
-    return dynamics.make_params(TABLES, targets, Parents(classes, reward), LIMITS, merge=False)
+    return make_params(TABLES, targets, Parents(classes, reward), LIMITS, spec)
 
 
-PARAMS = house_params()
-#: The same network and task for an agent that senses its way and where its target is, and for one
-#: that does not.
-SENSES = {"odometry": True, "triangulation": True}
-SENSING = {False: (MODEL, PARAMS), True: (MODEL.clone(**SENSES), PARAMS.replace(**SENSES))}
+PARAMS = house_params(ObservationSpec())
+SENSORS = ObservationSpec(sensors=("odometry", "triangulation"))
+#: Network and task without sensors, and the same with them.
+TASKS = {False: (MODEL, PARAMS), True: (MODEL.clone(spec=SENSORS), house_params(SENSORS))}
 begin = jax.jit(learner.init, static_argnums=(1, 2))
 rollout = jax.jit(learner.rollout, static_argnums=(2, 3))
 update = jax.jit(learner.update, static_argnums=(2, 3))
 
 
-def start(seed: int = 0, config: LearnerConfig = CONFIG, senses: bool = False) -> TrainState:
+def start(seed: int = 0, config: LearnerConfig = CONFIG, sensors: bool = False) -> TrainState:
     """A run with parameters that are far from the cautious initial ones."""
-    model, params = SENSING[senses]
+    model, params = TASKS[sensors]
     state = begin(jax.random.key(seed), config, model, WORDS, params)
     leaves, tree = jax.tree.flatten(state.params)
     rng = np.random.default_rng(seed)
@@ -96,11 +97,11 @@ def start(seed: int = 0, config: LearnerConfig = CONFIG, senses: bool = False) -
 
 @functools.cache
 def example(
-    senses: bool = False,
+    sensors: bool = False,
 ) -> tuple[TrainState, TrainState, Rollout, jax.Array, jax.Array]:
     """A state in mid-training, the state after its rollout, the rollout, values, advantages."""
-    model, params = SENSING[senses]
-    state = start(senses=senses)
+    model, params = TASKS[sensors]
+    state = start(sensors=sensors)
     before, *_ = rollout(state, jax.random.key(1), CONFIG, model, WORDS, params)
     after, steps, last = rollout(before, jax.random.key(2), CONFIG, model, WORDS, params)
     return before, after, steps, last, advantages_of(steps, last)
@@ -108,74 +109,77 @@ def example(
 
 @jax.jit
 def forward(weights: Any, carry: Carry, *seen: Any) -> tuple[Carry, Output]:
-    """The network without a tape."""
+    """The network without an activation cache."""
     table = actor_critic.prepare(MODEL, weights, WORDS)
     return actor_critic.forward(MODEL, weights, table, carry, *seen)
 
 
 def advantages_of(steps: Rollout, last: jax.Array) -> jax.Array:
-    flags = (steps.ended, steps.held)
+    flags = (steps.terminal, steps.bootstrap_only)
     return advantages(steps.reward, steps.value, last, *flags, CONFIG.gamma, CONFIG.gae_lambda)
 
 
 @pytest.mark.parametrize("bootstrap", [True, False])
-def test_rollouts_follow_the_slow_world_and_hold_time_outs_for_one_step(bootstrap: bool) -> None:
+def test_rollouts_follow_the_slow_world_and_value_time_outs_in_one_more_step(
+    bootstrap: bool,
+) -> None:
     config = dataclasses.replace(CONFIG, rollout_steps=1, bootstrap_truncated=bootstrap)
     world = World(TABLES, WORTH, LIMITS)
     state = start(3, config)
     episodes = [begun(state, b) for b in range(B)]
     waiting = np.zeros(B, bool)
-    seen = {"success": 0, "time-out": 0, "held": 0}
+    seen = {"success": 0, "time-out": 0, "valued": 0}
     for t in range(40):
         before = jax.device_get(state)
         key = jax.random.fold_in(jax.random.key(4), t)
         state, steps, _ = rollout(state, key, config, MODEL, WORDS, PARAMS)
-        step: Rollout = jax.device_get(jax.tree.map(lambda x: x[0], steps._replace(tape=None)))
+        steps = steps._replace(activations=None)
+        step: Rollout = jax.device_get(jax.tree.map(lambda x: x[0], steps))
         after = jax.device_get(state)
-        np.testing.assert_array_equal(step.held, waiting)
-        np.testing.assert_array_equal(step.fresh, before.fresh)
-        np.testing.assert_array_equal(step.previous, before.previous)
-        chosen = after.previous[np.arange(B), step.action]
+        np.testing.assert_array_equal(step.bootstrap_only, waiting)
+        np.testing.assert_array_equal(step.is_first, before.recurrent.is_first)
+        np.testing.assert_array_equal(step.prev_action_probs, before.recurrent.prev_action_probs)
+        probs = after.recurrent.prev_action_probs
         for b in range(B):
-            fresh = waiting[b]
+            is_first = waiting[b]
             if waiting[b]:
                 # The last state of a truncated episode: nothing happens, then a new episode.
-                seen["held"] += 1
+                seen["valued"] += 1
                 assert float(step.reward[b]) == 0
-                assert bool(step.ended[b])
-                assert not step.over[b]
+                assert bool(step.terminal[b])
+                assert not step.done[b]
                 assert not step.success[b]
                 waiting[b] = False
             else:
                 expected = world.act(episodes[b], int(step.action[b]))
                 assert float(step.reward[b]) == pytest.approx(expected.reward, abs=1e-6)
                 assert bool(step.success[b]) == expected.success
-                assert bool(step.over[b]) == (expected.terminated or expected.truncated)
+                assert bool(step.done[b]) == (expected.terminated or expected.truncated)
                 assert int(step.length[b]) == episodes[b].steps
                 assert int(step.shortest[b]) == int(before.env_state.shortest[b])
                 waiting[b] = expected.truncated and bootstrap
-                fresh = (expected.terminated or expected.truncated) and not waiting[b]
-                assert bool(step.ended[b]) == fresh
+                is_first = (expected.terminated or expected.truncated) and not waiting[b]
+                assert bool(step.terminal[b]) == is_first
                 seen["success"] += expected.success
                 seen["time-out"] += expected.truncated
-            assert bool(after.fresh[b]) == fresh
-            if fresh:
-                assert not after.previous[b].any()
+            assert bool(after.recurrent.is_first[b]) == is_first
+            if is_first:
+                assert not probs[b].any()
                 episodes[b] = begun(state, b)
             else:
-                # The episode goes on: its own last state, and the policy's own probabilities.
+                # The episode continues: its own last state, and the policy's own probabilities.
                 assert int(after.env_state.pose[b]) == state_of(episodes[b].pose)
-                assert after.previous[b].sum() == pytest.approx(1, abs=1e-5)
-                assert np.log(chosen[b]) == pytest.approx(step.log_prob[b], abs=1e-5)
-        np.testing.assert_array_equal(after.held, waiting)
+                assert probs[b].sum() == pytest.approx(1, abs=1e-5)
+                assert np.log(probs[b, step.action[b]]) == pytest.approx(step.log_prob[b], abs=1e-5)
+        np.testing.assert_array_equal(after.bootstrap_only, waiting)
         if t % 8 == 0:
             agrees_with_observe(step, before)
     assert min(seen["success"], seen["time-out"]) > 20
-    assert (seen["held"] > 20) == bootstrap
+    assert (seen["valued"] > 20) == bootstrap
 
 
 def begun(state: TrainState, b: int) -> Episode:
-    """The episode that the slow world should play beside the state's row b."""
+    """The episode that the slow world should play next to the state's row b."""
     row = jax.tree.map(lambda x: x[b], state.env_state)
     assert int(row.steps) == 0
     return Episode(pose_of(int(row.pose)), TABLES.targets[int(row.target)])
@@ -189,26 +193,27 @@ def agrees_with_observe(step: Rollout, before: TrainState) -> None:
 
 def test_recorded_values_and_probabilities_are_those_of_the_network() -> None:
     before, after, steps, last, _ = example()
-    seen = (steps.obs, steps.previous, steps.fresh, steps.keep)
-    carry, out = forward(before.params, before.carry, *seen)
+    seen = (steps.obs, steps.prev_action_probs, steps.is_first, steps.dropout_mask)
+    carry, out = forward(before.params, before.recurrent.carry, *seen)
     log_probs = jax.nn.log_softmax(out.logits)
     log_prob = jnp.take_along_axis(log_probs, steps.action[..., None], -1)[..., 0]
     # The same float32 sums, taken over all steps at once.
     close = {"rtol": 1e-4, "atol": 1e-5}
     chex.assert_trees_all_close((steps.value, steps.log_prob), (out.value, log_prob), **close)
-    chex.assert_trees_all_close(after.carry, carry, **close)
-    # Behind the rollout stands the state that the next one starts from, without dropout.
+    chex.assert_trees_all_close(after.recurrent.carry, carry, **close)
+    # The last value is of the state that the next rollout starts from, without dropout.
     obs = jax.vmap(dynamics.observe, (0, None))(after.env_state, PARAMS)
-    _, out = forward(before.params, after.carry, obs, after.previous, after.fresh)
+    rest = (obs, after.recurrent.prev_action_probs, after.recurrent.is_first)
+    _, out = forward(before.params, after.recurrent.carry, *rest)
     chex.assert_trees_all_close(last, out.value, **close)
 
 
 def test_carries_cross_the_borders_of_rollouts() -> None:
     before, after, _, _, _ = example()
-    going_on = ~np.asarray(before.fresh)
-    assert going_on.any()
-    assert np.asarray(before.carry[0])[going_on].any(axis=-1).all()
-    assert not np.array_equal(after.carry[0], before.carry[0])
+    in_progress = ~np.asarray(before.recurrent.is_first)
+    assert in_progress.any()
+    assert np.asarray(before.recurrent.carry[0])[in_progress].any(axis=-1).all()
+    assert not np.array_equal(after.recurrent.carry[0], before.recurrent.carry[0])
 
 
 @functools.partial(jax.jit, static_argnames="model")
@@ -222,68 +227,71 @@ def gradient(
     """Loss, its parts and its gradient for the parameters that acted."""
 
     def total(params: Any) -> Any:
-        arguments = (steps, advantage, state.carry, entropy, CONFIG, model, WORDS)
+        arguments = (steps, advantage, state.recurrent.carry, entropy, CONFIG, model, WORDS)
         return learner.loss(params, *arguments)
 
     return jax.value_and_grad(total, has_aux=True)(state.params)
 
 
-@pytest.mark.parametrize("senses", [False, True], ids=["plain", "triangulation"])
-def test_the_tape_changes_neither_the_loss_nor_its_gradient(senses: bool) -> None:
-    before, _, steps, _, advantage = example(senses)
-    model, _ = SENSING[senses]
-    taped = gradient(before, steps, advantage, 0.01, model=model)
-    plain = gradient(before, steps._replace(tape=None), advantage, 0.01, model=model)
+@pytest.mark.parametrize("sensors", [False, True], ids=["plain", "triangulation"])
+def test_the_activation_cache_changes_neither_the_loss_nor_its_gradient(sensors: bool) -> None:
+    before, _, steps, _, advantage = example(sensors)
+    model, _ = TASKS[sensors]
+    cached = gradient(before, steps, advantage, 0.01, model=model)
+    plain = gradient(before, steps._replace(activations=None), advantage, 0.01, model=model)
     # float32 sums over 240 states, in another order.
-    chex.assert_trees_all_close(taped, plain, rtol=2e-4, atol=2e-6)
-    if senses:
-        assert "way" in steps.tape
-        assert all(np.asarray(grad).any() for grad in taped[1]["way"].values())
+    chex.assert_trees_all_close(cached, plain, rtol=2e-4, atol=2e-6)
+    if sensors:
+        assert "sensor_embedding" in steps.activations
+        assert all(np.asarray(grad).any() for grad in cached[1]["sensor_embedding"].values())
 
 
-def test_what_is_sensed_of_the_way_begins_with_every_episode_and_goes_on_in_it() -> None:
-    _, after, steps, *_ = example(senses=True)
+def test_sensor_states_begin_with_every_episode_and_last_as_long_as_it() -> None:
+    _, after, steps, *_ = example(sensors=True)
     whole = jax.tree.map(
         lambda *x: jnp.concatenate([x[0], x[1][None]]),
-        (steps.obs, steps.fresh),
-        (jax.vmap(dynamics.observe, (0, None))(after.env_state, SENSING[True][1]), after.fresh),
+        (steps.obs, steps.is_first),
+        (
+            jax.vmap(dynamics.observe, (0, None))(after.env_state, TASKS[True][1]),
+            after.recurrent.is_first,
+        ),
     )
-    obs, fresh = jax.device_get(whole)  # [T + 1, B]
-    sensed = obs.odometry
+    obs, is_first = jax.device_get(whole)  # [T + 1, B]
+    odometry = obs.sensors["odometry"]
     seen = (obs.mask & (obs.classes == obs.target[..., None])).any(axis=-1)
-    known = sensed.target.any(axis=-1)
+    known = obs.sensors["triangulation"].any(axis=-1)
     # At first what is in view is all that is known; later, all that was.
-    np.testing.assert_array_equal(known[fresh], seen[fresh])
-    np.testing.assert_array_equal(known[1:], seen[1:] | (known[:-1] & ~fresh[1:]))
+    np.testing.assert_array_equal(known[is_first], seen[is_first])
+    np.testing.assert_array_equal(known[1:], seen[1:] | (known[:-1] & ~is_first[1:]))
     assert (known & ~seen).any()
     assert (known[:-1] & ~known[1:]).any()
     here = np.zeros((9, 9), bool)
     here[4, 4] = True
     for t, b in np.ndindex(T + 1, B):
-        place, last = sensed.motion[t, b, :2], sensed.motion[t, b, 6:]
-        if fresh[t, b]:
-            assert not place.any()
+        position, last = odometry.motion[t, b, :2], odometry.motion[t, b, 6:]
+        if is_first[t, b]:
+            assert not position.any()
             assert not last.any()
-            np.testing.assert_array_equal(sensed.window[t, b], here)
+            np.testing.assert_array_equal(odometry.window[t, b], here)
         elif t:
-            # Where a time-out waits to be valued, too: the way to the episode's last state.
+            # Also in a step that only values: there it is of the episode's last state.
             np.testing.assert_array_equal(last, np.eye(6)[steps.action[t - 1, b]])
-            assert sensed.window[t, b][4, 4] & 1
-    assert fresh[1:].sum() > 20
-    assert steps.held.any()
-    assert np.abs(sensed.motion[..., :2]).max() > 0
+            assert odometry.window[t, b][4, 4] & 1
+    assert is_first[1:].sum() > 20
+    assert steps.bootstrap_only.any()
+    assert np.abs(odometry.motion[..., :2]).max() > 0
 
 
 def test_the_loss_is_the_one_that_is_documented() -> None:
     before, _, steps, _, advantage = example()
     (total, parts), _ = gradient(before, steps, advantage, 0.03)
-    seen = (steps.obs, steps.previous, steps.fresh, steps.keep)
-    _, out = forward(before.params, before.carry, *seen)
+    seen = (steps.obs, steps.prev_action_probs, steps.is_first, steps.dropout_mask)
+    _, out = forward(before.params, before.recurrent.carry, *seen)
     logits, value = np.asarray(out.logits, np.float64), np.asarray(out.value, np.float64)
     policy, critic, entropy, count = 0.0, 0.0, 0.0, 0
     for t in range(T):
         for b in range(B):
-            if steps.held[t, b]:
+            if steps.bootstrap_only[t, b]:
                 continue
             count += 1
             p = np.exp(logits[t, b]) / np.exp(logits[t, b]).sum()
@@ -299,18 +307,18 @@ def test_the_loss_is_the_one_that_is_documented() -> None:
     assert float(total) == pytest.approx(expected, rel=1e-4)
 
 
-def test_held_steps_do_not_count() -> None:
+def test_bootstrap_only_steps_do_not_count() -> None:
     before, _, steps, _, advantage = example()
-    held = steps.held
-    assert held.any()
+    only = steps.bootstrap_only
+    assert only.any()
     other = steps._replace(
-        action=jnp.where(held, (steps.action + 1) % 6, steps.action),
-        value=jnp.where(held, 100.0, steps.value),
-        reward=jnp.where(held, 50.0, steps.reward),
+        action=jnp.where(only, (steps.action + 1) % 6, steps.action),
+        value=jnp.where(only, 100.0, steps.value),
+        reward=jnp.where(only, 50.0, steps.reward),
     )
     chex.assert_trees_all_equal(
         gradient(before, steps, advantage, 0.01),
-        gradient(before, other, jnp.where(held, 7.0, advantage), 0.01),
+        gradient(before, other, jnp.where(only, 7.0, advantage), 0.01),
     )
 
 
@@ -365,7 +373,7 @@ def test_an_update_is_one_step_of_clipped_adam_on_the_gradient_of_the_loss(
         key = jax.random.fold_in(state.key, number)
         _, steps, last = rollout(state, key, CONFIG, MODEL, WORDS, PARAMS)
         advantage = advantages_of(steps, last)
-        grads = gradient(state, steps._replace(tape=None), advantage, entropy)[1]
+        grads = gradient(state, steps._replace(activations=None), advantage, entropy)[1]
         change, memory = reference.update(grads, memory, state.params)
         expected = optax.apply_updates(state.params, change)
         state, _ = update(state, jnp.float32(progress), config, MODEL, WORDS, PARAMS)
@@ -382,7 +390,8 @@ def test_only_large_kernels_are_rounded_while_acting() -> None:
     assert max(x.size for x in jax.tree.leaves(state.params)) < learner.SMALL
     obs = jax.vmap(dynamics.observe, (0, None))(state.env_state, PARAMS)
     table = actor_critic.prepare(model, state.params, WORDS)
-    seen = (state.carry, obs, state.previous, state.fresh)
+    recurrent = state.recurrent
+    seen = (recurrent.carry, obs, recurrent.prev_action_probs, recurrent.is_first)
     _, out = actor_critic.forward(model, state.params, table, *seen)
     np.testing.assert_allclose(steps.value[0], out.value, rtol=1e-5)
 
@@ -392,7 +401,7 @@ def test_the_explained_variance_is_that_of_the_returns_that_count() -> None:
     key = jax.random.fold_in(state.key, 0)
     _, steps, last = rollout(state, key, CONFIG, MODEL, WORDS, PARAMS)
     advantage = np.asarray(advantages_of(steps, last))
-    counted = ~np.asarray(steps.held)
+    counted = ~np.asarray(steps.bootstrap_only)
     returns = (np.asarray(steps.value) + advantage)[counted]
     _, metrics = update(state, progress, CONFIG, MODEL, WORDS, PARAMS)
     expected = 1 - advantage[counted].var() / returns.var()
@@ -415,7 +424,7 @@ def test_metrics_are_sums_over_the_episodes_that_finished() -> None:
     won, least, taken = [], [], []
     for t in range(T):
         for b in range(B):
-            if steps.over[t, b]:
+            if steps.done[t, b]:
                 won.append(bool(steps.success[t, b]))
                 least.append(int(steps.shortest[t, b]))
                 taken.append(int(steps.length[t, b]))
@@ -426,7 +435,7 @@ def test_metrics_are_sums_over_the_episodes_that_finished() -> None:
     assert 100 * float(metrics["success_sum"]) / len(won) == pytest.approx(rate)
     assert 100 * float(metrics["spl_sum"]) / len(won) == pytest.approx(spl, rel=1e-5)
     assert int(metrics["length_sum"]) == sum(taken)
-    assert int(metrics["held_steps"]) == int(steps.held.sum()) > 0
+    assert int(metrics["bootstrap_only_steps"]) == int(steps.bootstrap_only.sum()) > 0
     assert float(metrics["reward_sum"]) == pytest.approx(float(steps.reward.sum()), rel=1e-5)
     assert int(update(after, jnp.float32(0), CONFIG, MODEL, WORDS, PARAMS)[0].episodes) > len(won)
 
@@ -445,7 +454,7 @@ def test_a_gradient_that_is_not_finite_skips_the_update_and_is_counted(fault: st
     assert int(after.skipped) == 1
     assert int(after.updates) == 2
     assert int(after.episodes) > int(state.episodes)
-    # Once the fault is gone, training goes on with what was kept.
+    # Once the fault is gone, training continues with what was kept.
     for _ in range(3):
         after, metrics = update(after, jnp.float32(0), CONFIG, MODEL, WORDS, PARAMS)
     assert np.isfinite(float(metrics["grad_norm"]))
@@ -508,15 +517,15 @@ def test_a_chunk_is_traced_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_dropout_keeps_its_share_and_is_off_at_zero() -> None:
     *_, steps, _, _ = example()
-    assert steps.keep is not None
-    kept = np.asarray(steps.keep)
+    assert steps.dropout_mask is not None
+    kept = np.asarray(steps.dropout_mask)
     # 2,880 draws at 0.75: the standard deviation of their mean is 0.008.
     assert abs(kept.mean() - 0.75) < 0.04
     assert len(np.unique(kept.reshape(-1, kept.shape[-1]), axis=0)) > T * B / 4
     none = ActorCritic(TDANetEncoder(width=12, dropout=0.0), hidden=8)
     state = begin(jax.random.key(0), CONFIG, none, WORDS, PARAMS)
     _, steps, _ = rollout(state, jax.random.key(1), CONFIG, none, WORDS, PARAMS)
-    assert steps.keep is None
+    assert steps.dropout_mask is None
 
 
 def test_a_small_task_is_learnt() -> None:
