@@ -118,10 +118,10 @@ def check_new_file(path: Path, in_folder: bool = True) -> None:
 
 def check_picture(out: Path) -> None:
     """Fails unless --out ends in a format that pictures can be written in."""
-    from tdanet_jax.analysis import pictures
+    from tdanet_jax.analysis import drawing
 
-    if out.suffix[1:] not in pictures.formats():
-        fail(f"--out {out}: end it in one of .{', .'.join(pictures.formats())}")
+    if out.suffix[1:] not in drawing.formats():
+        fail(f"--out {out}: end it in one of .{', .'.join(drawing.formats())}")
 
 
 def check_at_most(flag: str, value: int, most: int) -> None:

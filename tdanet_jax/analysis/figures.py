@@ -1,34 +1,38 @@
-"""Pictures of a run."""
+"""Charts of runs: learning curves, costs, and mean attention."""
 
 from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter
 
+from tdanet_jax.analysis import drawing
+from tdanet_jax.analysis.attention import MIN_FRAMES, ClassPairs
+from tdanet_jax.analysis.drawing import BLUE, GREEN, MARKERS, ORANGE, PALETTE, SHADES
 from tdanet_jax.evaluation.comparison import MEASURES, Curve
-from tdanet_jax.io import files
 from tdanet_jax.splits import GROUPS
 
-#: Colours (Okabe and Ito) that stay apart for the colour-blind and, with the dashes, in grey.
-BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"
-PALETTE = (BLUE, ORANGE, GREEN, "#CC79A7", "#000000", "#E69F00", "#56B4E9", "#F0E442")
-#: Shapes for many lines in one picture, so that they stay apart without colour.
-MARKERS = "osD^vPX*"
+DPI = 130
+#: Line style, colour and label of what training keeps in memory.
+_MEMORY = {
+    "temporary_mb": ("s-", ORANGE, "rollout and activation cache"),
+    "arguments_mb": ("^--", GREEN, "rooms, parameters, state"),
+}
 
 
 def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> None:
     """Success, SPL, episode length and entropy against training episodes, from metrics rows."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
-    FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     episodes = [row["episodes"] for row in rows]
 
@@ -50,23 +54,20 @@ def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> No
     for axis in (left, right):
         _episodes_along(axis)
     figure.suptitle(_in_lines(title))
-    with files.replacing(path) as fresh:
-        figure.savefig(fresh, dpi=130)
+    drawing.save(figure, path, DPI)
 
 
 def scaling(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Steps per second and memory of training against each `size` and its `value`."""
     sizes = list(dict.fromkeys(row["size"] for row in rows))
     figure = Figure(figsize=(3 * len(sizes), 5), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, len(sizes), sharey="row", sharex="col", squeeze=False)
     for column, size in zip(axes.T, sizes, strict=True):
         chosen = [row for row in rows if row["size"] == size]
         values = [row["value"] for row in chosen]
         column[0].plot(values, [row["steps_per_second"] for row in chosen], "o-", color=BLUE)
-        for name, style, color in (("temporary_mb", "s-", ORANGE), ("arguments_mb", "^--", GREEN)):
-            memory = [row[name] for row in chosen]
-            column[1].plot(values, memory, style, color=color, label=_MEMORY[name])
+        for name, (style, color, label) in _MEMORY.items():
+            column[1].plot(values, [row[name] for row in chosen], style, color=color, label=label)
         column[1].set(xscale="log", yscale="log", xlabel=size, xticks=values)
         column[1].xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.0f}"))
         column[1].minorticks_off()
@@ -78,11 +79,7 @@ def scaling(rows: Sequence[dict[str, Any]], path: Path) -> None:
     axes[0, 0].yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:,.0f}"))
     axes[1, 0].set_ylabel("memory (MB)")
     axes[1, -1].legend(frameon=False, loc="upper center")
-    with files.replacing(path) as fresh:
-        figure.savefig(fresh, dpi=130)
-
-
-_MEMORY = {"temporary_mb": "rollout and tape", "arguments_mb": "rooms, parameters, state"}
+    drawing.save(figure, path, DPI)
 
 
 def evaluated_curves(curves: Sequence[Curve], title: str, path: Path) -> None:
@@ -91,7 +88,6 @@ def evaluated_curves(curves: Sequence[Curve], title: str, path: Path) -> None:
     Seen targets are solid lines, unseen ones dashed; a band is one deviation over seeds.
     """
     figure = Figure(figsize=(9, 4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(1, 2)
     for axis, measure in zip(axes, MEASURES, strict=True):
         for i, curve in enumerate(curves):
@@ -103,8 +99,7 @@ def evaluated_curves(curves: Sequence[Curve], title: str, path: Path) -> None:
     figure.suptitle(_in_lines(title))
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-    with files.replacing(path) as fresh:
-        figure.savefig(fresh, dpi=130)
+    drawing.save(figure, path, DPI)
 
 
 def _in_lines(title: str) -> str:
@@ -113,7 +108,7 @@ def _in_lines(title: str) -> str:
 
 
 def _draw_curve(
-    axis: Axes, curve: Curve, group: str, measure: str, colour: str, marker: str
+    axis: Axes, curve: Curve, group: str, measure: str, color: str, marker: str
 ) -> None:
     """One line of a learning curve, with its band, if there is anything to draw."""
     points = zip(curve.episodes, curve.values[group, measure], strict=True)
@@ -123,11 +118,11 @@ def _draw_curve(
     x, mean, sd = np.array(known).T
     seen = group == "seen"
     axis.plot(
-        x, mean, "-" if seen else "--", color=colour, marker=marker, markersize=4, linewidth=1.5,
-        markerfacecolor=colour if seen else "white", label=f"{curve.label}, {group}",
+        x, mean, "-" if seen else "--", color=color, marker=marker, markersize=4, linewidth=1.5,
+        markerfacecolor=color if seen else "white", label=f"{curve.label}, {group}",
     )  # fmt: skip
     if sd.any():
-        axis.fill_between(x, mean - sd, mean + sd, color=colour, alpha=0.15, linewidth=0)
+        axis.fill_between(x, mean - sd, mean + sd, color=color, alpha=0.15, linewidth=0)
 
 
 def _episodes_along(axis: Axes) -> None:
@@ -136,3 +131,46 @@ def _episodes_along(axis: Axes) -> None:
     axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x / 1000:,.0f}k"))
     axis.grid(alpha=0.3)
     axis.spines[["top"]].set_visible(False)
+
+
+def class_pairs(pairs: ClassPairs, unseen: Collection[str], title: str, path: Path) -> None:
+    """Mean attention by class pair; columns are the classes that any target attends to most."""
+    value = np.where(pairs.frames >= MIN_FRAMES, pairs.attention, np.nan)
+    kept = [g for g in range(len(pairs.targets)) if np.isfinite(value[g]).any()]
+    value = value[kept]
+    # The seen classes with the greatest mean attention for any target, in the order of the targets
+    # that attend to them.
+    best = np.nan_to_num(value, nan=-1.0).max(axis=0, initial=-1.0)
+    columns = np.sort(np.argsort(-best, kind="stable")[: min(40, (best >= 0).sum())])
+    own = {name: i for i, name in enumerate(pairs.targets[g] for g in kept)}
+    order = sorted(columns, key=lambda c: (own.get(pairs.classes[c], len(own)), pairs.classes[c]))
+    value = value[:, order]
+    figure = Figure(figsize=(2.2 + 0.36 * len(order), 2.6 + 0.3 * len(kept)), layout="constrained")
+    axes = figure.subplots()
+    axes.patch.set(facecolor="white", hatch="////", edgecolor="0.8", linewidth=0)
+    if value.size:
+        axes.imshow(value, cmap=SHADES, vmin=0, vmax=1, aspect="auto")
+    for g, c in zip(*np.nonzero(value >= 0.095), strict=True):
+        color = "white" if value[g, c] > 0.85 else "black"
+        text = f"{100 * value[g, c]:.0f}"
+        axes.text(c, g, text, ha="center", va="center", fontsize=7.5, color=color)
+    for row, g in enumerate(kept):
+        if pairs.targets[g] in (names := [pairs.classes[c] for c in order]):
+            column = names.index(pairs.targets[g])
+            corner = (column - 0.5, row - 0.5)
+            axes.add_patch(Rectangle(corner, 1, 1, fill=False, edgecolor="black", lw=1.6))
+    named = [pairs.targets[g] + ("*" if pairs.targets[g] in unseen else "") for g in kept]
+    axes.set_yticks(range(len(kept)), named, fontsize=9)
+    axes.set_xticks(range(len(order)), [pairs.classes[c] for c in order], fontsize=9, rotation=90)
+    axes.set(xlabel="class in view", ylabel="target")
+    axes.spines[:].set_visible(False)
+    bar = figure.colorbar(ScalarMappable(Normalize(0, 100), SHADES), ax=axes, pad=0.01, aspect=30)
+    bar.set_label("mean attention, per cent")
+    note = (
+        "framed: the target, where in view; others: in frames without the target; "
+        f"hatched: fewer than {MIN_FRAMES} frames"
+    )
+    if unseen:
+        note += "; * never a target in training"
+    axes.set_title(f"{title}\n{note}", fontsize=10)
+    drawing.save(figure, path)

@@ -1,20 +1,21 @@
-"""Where names go in a picture so that none covers another."""
+"""Where the names of objects go in a picture, so that none covers another."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from tdanet_jax.analysis.trace import View
 from tdanet_jax.scenes import floor_plan
+from tdanet_jax.scenes.camera_view import CameraView
 from tdanet_jax.scenes.floor_plan import FloorPlan
+from tdanet_jax.vocabulary import IGNORED
 
-#: Height of a line and advance of a letter, in units of the font's size; on the wide side, as the
+#: Height of a line and advance of a letter as multiples of the font size; generous, since the
 #: reader's font is not known.
 LINE, LETTER = 1.15, 0.7
-#: What is left free at the sides of a picture, in the same units.
+#: Free margin at the sides of a picture, in the same units.
 MARGIN = 0.3
 _ADVANCE = {
     **dict.fromkeys("ijlI .,:'", 0.35),
@@ -26,12 +27,12 @@ Rectangle = tuple[float, float, float, float]  # x1, y1, x2, y2, y down
 
 
 class Label(NamedTuple):
-    """A name that has found a place; x and y are its left upper corner."""
+    """A placed name; x and y are its upper left corner."""
 
     text: str
     x: float
     y: float
-    of: int  # which of the things it belongs to
+    of: int  # index of the object it names
 
 
 def place(
@@ -41,14 +42,14 @@ def place(
     centred: bool = False,
     most: int | None = None,
 ) -> list[Label]:
-    """Puts names at their rectangles, the first ones first; those without room are left out.
+    """Places names at their rectangles, in order; those without room are left out.
 
     Args:
       things: (name, rectangle), most important first.
-      size: of the font, in units of the rectangles.
-      bounds: no name sticks out of these, or touches their sides.
-      centred: names start from the middle of their rectangles instead of the corners.
-      most: how many names at most.
+      size: of the font, in the unit of the rectangles.
+      bounds: the picture; no name touches its sides.
+      centred: tries the middle of a rectangle first instead of its corners.
+      most: the greatest number of names.
     """
     placed: list[Label] = []
     taken: list[Rectangle] = []
@@ -69,7 +70,7 @@ def place(
 
 
 def extent(text: str, size: float) -> tuple[float, float]:
-    """Width and height of a name in a font of some size."""
+    """Width and height of a name in a font of this size."""
     return size * sum(_ADVANCE.get(letter, LETTER) for letter in text), LINE * size
 
 
@@ -99,71 +100,68 @@ def _centred(thing: Rectangle, width: float, height: float) -> Iterable[tuple[fl
     yield x, y
 
 
-def _inside(spot: Rectangle, bounds: Rectangle) -> bool:
-    return (
-        spot[0] >= bounds[0]
-        and spot[1] >= bounds[1]
-        and spot[2] <= bounds[2]
-        and spot[3] <= bounds[3]
-    )
+def _inside(a: Rectangle, b: Rectangle) -> bool:
+    return a[0] >= b[0] and a[1] >= b[1] and a[2] <= b[2] and a[3] <= b[3]
 
 
 def _overlap(a: Rectangle, b: Rectangle) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-#: Size of the names' font as a share of the picture's width.
+#: Font size as a share of the picture's greater side.
 VIEW_FONT, PLAN_FONT = 0.034, 0.027
-#: Names in a view, and the least attention (a share) that is told with a name.
+#: The greatest number of names in a view, and the least attention that is written after a name.
 MOST_NAMES, LEAST_ATTENTION = 12, 0.005
-#: Objects of the room that are named on a plan: at least this large, square metres.
+#: The least area of an object that is named on a plan, in square metres.
 LEAST_AREA = 0.15
 
 
-def of_view(view: View, attention: np.ndarray | None, target: str) -> list[Label]:
-    """Names of the target, of what is most attended to and of the largest; shares of the image.
+def of_view(
+    view: CameraView, attention: np.ndarray | None, target: str | None, scale: float = 1.0
+) -> list[Label]:
+    """Names of the target, the most attended and the largest objects; in shares of the image.
 
     Args:
       attention: [n] weight of each object in view, or None.
+      scale: of the font; with a smaller font there are more names.
     """
     boxes = view.boxes
     size = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     rank = size if attention is None else attention + LEAST_ATTENTION * size
     order = sorted(range(len(boxes)), key=lambda i: (view.classes[i] != target, -rank[i]))
-    chosen, things = [], []
+    things = []
     for i in order:
         text = view.classes[i]
         if attention is not None and attention[i] >= LEAST_ATTENTION:
             text += f" {100 * attention[i]:.0f}%"
         x1, y1, x2, y2 = map(float, boxes[i])
-        chosen.append(i)
         things.append((text, (x1, y1, x2, y2)))
-    placed = place(things, VIEW_FONT, (0, 0, 1, 1), most=MOST_NAMES)
-    return [label._replace(of=chosen[label.of]) for label in placed]
+    placed = place(things, scale * VIEW_FONT, (0, 0, 1, 1), most=round(MOST_NAMES / scale**2))
+    return [label._replace(of=order[label.of]) for label in placed]
 
 
-def of_plan(plan: FloorPlan, target: str, scale: float = 1.0) -> list[Label]:
-    """Names of the targets and of the largest object of each class; metres, y is minus z.
+def of_plan(plan: FloorPlan, first: Collection[int], scale: float = 1.0) -> list[Label]:
+    """Names of the given objects and of the largest of each other class; metres, y is minus z.
 
     Args:
+      first: indices of the outlines that are named first, whatever their size.
       scale: of the font.
     """
     x1, z1, x2, z2 = plan.extent
-    order = sorted(range(len(plan.classes)), key=lambda i: plan.classes[i] != target)
-    chosen, things, named = [], [], {"Floor"}
-    for i in order:
-        name, outline = plan.classes[i], plan.outlines[i]
-        if name != target and (name in named or floor_plan.area(outline) < LEAST_AREA):
-            continue
-        named.add(name)
-        (left, low), (right, high) = outline.min(axis=0), outline.max(axis=0)
-        chosen.append(i)
-        things.append((name, (float(left), float(-high), float(right), float(-low))))
+    chosen, named = list(first), {IGNORED, *(plan.classes[i] for i in first)}
+    for i, (name, outline) in enumerate(zip(plan.classes, plan.outlines, strict=True)):
+        if name not in named and floor_plan.area(outline) >= LEAST_AREA:
+            named.add(name)
+            chosen.append(i)
+    things = []
+    for i in chosen:
+        (left, low), (right, high) = plan.outlines[i].min(axis=0), plan.outlines[i].max(axis=0)
+        things.append((plan.classes[i], (float(left), float(-high), float(right), float(-low))))
     placed = place(things, scale * plan_font(plan), (x1, -z2, x2, -z1), centred=True)
     return [label._replace(of=chosen[label.of]) for label in placed]
 
 
 def plan_font(plan: FloorPlan) -> float:
-    """Size of the names on a plan, in metres."""
+    """Font size of the names on a plan, in metres."""
     x1, z1, x2, z2 = plan.extent
     return PLAN_FONT * max(x2 - x1, z2 - z1)

@@ -11,8 +11,8 @@ import numpy as np
 
 from tdanet_jax import poses
 from tdanet_jax.analysis import labels
-from tdanet_jax.analysis.trace import Trace, view
-from tdanet_jax.scenes import floor_plan
+from tdanet_jax.analysis.trace import Trace
+from tdanet_jax.scenes import camera_view, floor_plan
 from tdanet_jax.scenes.floor_plan import FloorPlan
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
@@ -95,7 +95,7 @@ def _step(trace: Trace, tables: SceneTables, i: int) -> dict[str, Any]:
     parts = poses.split(pose)
     x, _, z = tables.position[parts.position]
     rotation, horizon = parts.degrees
-    seen = view(tables, pose)
+    seen = camera_view.of_pose(tables, pose)
     weights = None if trace.attention is None or last else trace.attention[i]
     step: dict[str, Any] = {
         "place": [round(METRE * float(x)), round(-METRE * float(z))],

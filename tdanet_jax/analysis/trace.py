@@ -27,6 +27,7 @@ from tdanet_jax.evaluation.policies import Policy
 from tdanet_jax.evaluation.rollout import Records
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.scenes import camera_view
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.task import Task, task_in
@@ -129,30 +130,6 @@ class Trace:
         return f"{how}, {count} action{'s'[: count != 1]}, shortest {self.shortest}"
 
 
-class View(NamedTuple):
-    """The n detections from a pose, an object each, in the tables' order."""
-
-    classes: tuple[str, ...]
-    boxes: np.ndarray  # [n, 4] x1, y1, x2, y2 as shares of the image, y down
-    within_reach: np.ndarray  # [n] bool, visible in the sense of the task: within 1.5 m
-
-
-def view(tables: SceneTables, pose: int) -> View:
-    """What is in view from a pose."""
-    rows = _detected(tables, pose)
-    return View(
-        classes=tuple(tables.classes[c] for c in tables.row_class[rows]),
-        boxes=tables.row_box[rows] / (tables.image * tables.subpixel),
-        within_reach=tables.row_visible[rows],
-    )
-
-
-def _detected(tables: SceneTables, pose: int) -> np.ndarray:
-    """The tables' rows of a pose that are detections: those with a box."""
-    rows = np.arange(tables.row_start[pose], tables.row_start[pose + 1])
-    return rows[tables.row_box[rows, 0] >= 0]
-
-
 def play(player: Player, tables: SceneTables, episode: Episodes, seed: int = 0) -> Trace:
     """Lets the player play one episode to its end. Equal seeds, equal actions."""
     params, key = player.task.eval_params, jax.random.key(seed)
@@ -233,7 +210,7 @@ def _with_network(player: Player, tables: SceneTables, trace: Trace, goal: int) 
 
 def _rows_of_objects(tables: SceneTables, pose: int, params: EnvParams) -> np.ndarray:
     """The observation's row of each of the n objects in view: [n] int."""
-    classes = tables.row_class[_detected(tables, pose)]
+    classes = tables.row_class[camera_view.rows_of_pose(tables, pose)]
     if int(params.row_start[pose + 1] - params.row_start[pose]) == len(classes):
         return np.arange(len(classes))
     return np.unique(classes, return_inverse=True)[1]  # rows are one a class, in the same order

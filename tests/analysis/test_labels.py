@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tdanet_jax.analysis import labels, trace
-from tdanet_jax.scenes import floor_plan
+from tdanet_jax.analysis import labels
+from tdanet_jax.scenes import camera_view, floor_plan
 
 corner = st.floats(0, 0.9)
 things = st.lists(
@@ -51,7 +51,7 @@ def test_no_two_overlap_and_none_sticks_out(found, centred):
 def test_a_view_names_the_target_and_the_most_attended(ithor):
     counts = np.diff(ithor.row_start)
     for pose in np.flatnonzero(counts > 20)[::3000]:
-        view = trace.view(ithor, int(pose))
+        view = camera_view.of_pose(ithor, int(pose))
         weights = np.linspace(0, 1, len(view.boxes)) ** 6
         weights /= weights.sum()
         target = view.classes[0]

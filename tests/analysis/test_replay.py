@@ -10,6 +10,7 @@ import pytest
 from tdanet_jax.analysis import replay, trace
 from tdanet_jax.analysis.trace import Player
 from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.scenes import camera_view
 from tdanet_jax.scenes.dataset import Rooms
 from tests.support import browser
 
@@ -41,7 +42,7 @@ def test_the_page_holds_the_traces(traces, some_rooms):
     network, best = episode["players"]
     assert len(network["steps"]) == len(traces[0].actions) + 1
     for i, step in enumerate(network["steps"][:-1]):
-        view = trace.view(some_rooms, traces[0].pose[i])
+        view = camera_view.of_pose(some_rooms, traces[0].pose[i])
         assert [box[0] for box in step["boxes"]] == list(view.classes)
         np.testing.assert_allclose(step["attention"], traces[0].attention[i], atol=1e-4)
         np.testing.assert_allclose(step["probabilities"], traces[0].probabilities[i], atol=1e-4)
@@ -147,10 +148,10 @@ def test_each_step_shows_its_boxes_shades_and_probabilities(visit, traces, some_
             "boxes => boxes.map(b => Number(b.getAttribute('fill-opacity')))"
         )
         np.testing.assert_allclose(sorted(shown), np.sort(0.85 * weights), atol=1e-3)
-        view = trace.view(some_rooms, traces[0].pose[step])
+        view = camera_view.of_pose(some_rooms, traces[0].pose[step])
         sought = sum(name == "Television" for name in view.classes)
         assert network.locator("svg.view rect.target").count() == sought
-        near = [n for n, ok in zip(view.classes, view.within_reach, strict=True) if ok]
+        near = [n for n, ok in zip(view.classes, view.visible, strict=True) if ok]
         far = sought - near.count("Television")
         assert network.locator("svg.view rect.target.far").count() == far
         taken = network.locator("tr.taken")
