@@ -145,17 +145,9 @@ def cached_lstm(
     return cache.gates[..., -cache.cell.shape[-1] :] * jnp.tanh(cache.cell), cache.cell
 
 
-def _cached_lstm_fwd(
-    weights: LSTMWeights,
-    carry: Carry,
-    x: jax.Array,
-    skip_inputs: jax.Array,
-    is_first: jax.Array,
-    dtype: Any,
-    cache: LSTMCache,
-) -> tuple[Carry, tuple]:
-    out = cached_lstm(weights, carry, x, skip_inputs, is_first, dtype, cache)
-    return out, (weights, carry, skip_inputs, is_first, cache)
+def _cached_lstm_fwd(*inputs: Any) -> tuple[Carry, tuple]:
+    weights, carry, _, skip_inputs, is_first, _, cache = inputs
+    return cached_lstm(*inputs), (weights, carry, skip_inputs, is_first, cache)
 
 
 def _cached_lstm_bwd(dtype: Any, saved: tuple, cotangents: Carry) -> tuple:
