@@ -52,7 +52,6 @@ def main(arguments: list[str] | None = None) -> None:
 def show(command: Command) -> None:
     """Plays, and writes the tables and pictures."""
     from tdanet_jax.analysis import pictures
-    from tdanet_jax.io import files
     from tdanet_jax.training import devices
 
     devices.keep_compiled()
@@ -75,9 +74,8 @@ def show(command: Command) -> None:
         trace = one_episode.play(chosen, [player], tables, choice.seed)[0]
     out.mkdir(parents=True, exist_ok=True)
     picture = out / f"{trace.scene}-{trace.target}.png"
-    with files.replacing(picture) as path:
-        title = f"{player.name}: {trace.target} in {trace.scene}"
-        pictures.attention_episode(trace, tables, title, path)
+    title = f"{player.name}: {trace.target} in {trace.scene}"
+    pictures.attention_episode(trace, tables, title, picture)
     console.print(f"{trace.target} in {trace.scene}: {trace.outcome}")
     console.print(f"wrote {picture}")
 
@@ -103,7 +101,7 @@ def write_pairs(player: Player, tables: SceneTables, played: Played, out: Path) 
     """Writes the mean attention by class pair as a table, a page and a picture."""
     import numpy as np
 
-    from tdanet_jax.analysis import attention, pictures, trace
+    from tdanet_jax.analysis import attention, figures, trace
     from tdanet_jax.io import files
 
     assert player.model is not None
@@ -125,10 +123,8 @@ def write_pairs(player: Player, tables: SceneTables, played: Played, out: Path) 
     title = f"Attention of {player.name}, test episodes of split {task.split.name}"
     with files.replacing(out / "class_pairs.csv") as path:
         attention.write_csv(pairs, path)
-    with files.replacing(out / "class_pairs.md") as path:
-        path.write_text(attention.markdown(pairs, title, unseen))
-    with files.replacing(out / "class_pairs.png") as path:
-        pictures.class_pairs(pairs, unseen, title, path)
+    files.write_text(out / "class_pairs.md", attention.markdown(pairs, title, unseen))
+    figures.class_pairs(pairs, unseen, title, out / "class_pairs.png")
     console.print(f"{len(pose):,} frames; wrote {out / 'class_pairs.csv'}, .md and .png")
 
 

@@ -110,7 +110,7 @@ def draw_plan(
             axes.add_patch(Polygon(outline, fill=False, edgecolor="black", lw=2.2, zorder=6))
     axes.plot(*plan.points.T, ".", color="0.6", ms=1.5, zorder=2)
     size = scale * _font(axes, plan)
-    sought = [i for i, name in enumerate(plan.classes) if name == target]
+    sought = plan.of_class(target)
     for label in labels.of_plan(plan, [*sought, *colors], scale):
         color = colors.get(label.of, "black")
         _write(axes, label.text, label.x, -label.y, size, label.of in sought, color)

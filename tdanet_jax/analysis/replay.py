@@ -35,7 +35,7 @@ def page(traces: Sequence[Trace], tables: SceneTables) -> str:
     first = traces[0]
     if any((t.pose[0], t.target) != (first.pose[0], first.target) for t in traces):
         raise ValueError("the traces start in different places or look for different targets")
-    plan = floor_plan.load(tables, first.scene)
+    plan = floor_plan.of_room(tables, first.scene)
     room = ROOM_TYPES[tables.room_type[tables.scenes.index(first.scene)]]
     episode = {
         "scene": first.scene,
@@ -74,7 +74,7 @@ def _plan(plan: FloorPlan, target: str, scale: float) -> dict[str, Any]:
         ],
         "labels": [
             [label.text, round(METRE * label.x), round(METRE * label.y), plan.classes[label.of]]
-            for label in labels.of_plan(plan, target, scale)
+            for label in labels.of_plan(plan, plan.of_class(target), scale)
         ],
     }
 

@@ -65,8 +65,8 @@ def test_a_view_names_the_target_and_the_most_attended(ithor):
 
 def test_a_plan_names_the_target_first_and_each_class_once(ithor):
     for scene, target in (("FloorPlan228", "Laptop"), ("FloorPlan21", "CoffeeMachine")):
-        plan = floor_plan.load(ithor, scene)
-        placed = labels.of_plan(plan, target)
+        plan = floor_plan.of_room(ithor, scene)
+        placed = labels.of_plan(plan, plan.of_class(target))
         assert placed[0].text == target
         assert len({label.text for label in placed}) == len(placed) > 6
         assert apart(placed, labels.plan_font(plan))
