@@ -42,8 +42,8 @@ class ObservationSpec:
             if "odometry" not in before:
                 raise ValueError("--triangulation: needs --odometry (or use --no-triangulation)")
             if self.rows != "object" or self.image is not None:
-                shown = f"--rows {self.rows}" if model is None else model
+                what = model or (f"--image {self.image}" if self.image else f"--rows {self.rows}")
                 raise ValueError(
-                    f"--triangulation: needs a box of every object, which {shown} does not show; "
+                    f"--triangulation: needs a box of every object, which {what} does not show; "
                     "use --no-triangulation"
                 )

@@ -13,6 +13,7 @@ from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.registry import MODELS, find_make
+from tdanet_jax.sensors import suite
 
 
 def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
@@ -24,7 +25,7 @@ def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
 
     Raises:
       ValueError: `config.model` names a module that cannot be imported or makes no `ActorCritic`,
-        or the model is not shown what a sensor needs.
+        the model is not shown what a sensor needs, or a sensor cannot be made.
     """
     module, options = MODELS.get(config.model, (config.model, {}))
     network = config.network
@@ -40,6 +41,7 @@ def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
         sensors=tuple(dict.fromkeys((*asked.sensors, *model.spec.sensors))),
     )
     spec.check(config.model)
+    suite.make(spec)  # a sensor that cannot be made is refused here, too
     return model.clone(spec=spec)
 
 

@@ -42,7 +42,7 @@ class Sensor:
     """Base class of the sensors.
 
     A state and a reading are arrays, or trees of arrays. `others` holds the states of the sensors
-    that come before this one, by name, as they are at the same moment.
+    that come before this one, by name, as they are at the same moment; in `read`, of all sensors.
 
     Attributes:
       REQUIRES: names of sensors that must come before it.
