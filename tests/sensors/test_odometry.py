@@ -21,7 +21,7 @@ from tdanet_jax.env.reward import no_parents
 from tdanet_jax.env.types import EnvParams, EnvState, Observation
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.scenes import SceneTables
-from tdanet_jax.scenes.tables import build
+from tdanet_jax.scenes.tabulation import build
 from tdanet_jax.sensors import suite
 from tdanet_jax.sensors.odometry import Odometry, OdometryReading, OdometryState
 from tdanet_jax.sensors.sensor import Motion, Start
