@@ -1,9 +1,9 @@
 """Griffe extension: a comment at a field or constant is its documentation.
 
-    reward: jax.Array  # [T, B] float32, reward of each step
+reward: jax.Array  # [T, B] float32, reward of each step
 
-    #: Actions after which a test episode is truncated.
-    TEST_STEP_LIMITS = ...
+#: Actions after which a test episode is truncated.
+TEST_STEP_LIMITS = ...
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import griffe
 
 
 class FieldComments(griffe.Extension):
-    """Gives attributes without a docstring the comment behind them, or the `#:` lines above them."""
+    """Documents attributes that lack a docstring with their comments."""
 
     def on_attribute_instance(self, *, attr: griffe.Attribute, **_: Any) -> None:
         """Called for every attribute that is found."""

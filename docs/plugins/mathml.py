@@ -1,4 +1,4 @@
-"""MkDocs hook: turns LaTeX into MathML at build time, so that pages need no script and no network."""
+"""MkDocs hook: turns LaTeX into MathML when the site is built; pages need no script for it."""
 
 from __future__ import annotations
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import importlib.util
-import io
 import json
 import re
 import statistics
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -22,13 +18,6 @@ from tests.support.pages import DOCS
 
 ROOT = DOCS.parent
 PAGES = ("data", "scenes", "evaluation", "analysis", "results", "speed", "reliability")
-COMMANDS = (
-    "attention", "benchmark", "evaluate", "replay", "scaling", "scenes verify", "scenes inspect",
-    "scenes build", "scenes import", "scenes export", "scenes collect", "share", "sweep",
-    "train_zero_shot", "trajectories",
-)  # fmt: skip
-#: Flags of other programs that the pages mention.
-FOREIGN = {"--check", "--xla_gpu_deterministic_ops"}
 
 
 def text(page: str) -> str:
@@ -60,55 +49,6 @@ def code(part: str) -> list[str]:
 def named(part: str) -> set[str]:
     """What the first cells of a part's tables name in backticks."""
     return {name for cells in rows(part) for name in code(cells[0])}
-
-
-def pages(*words: str) -> Any:
-    return pytest.mark.parametrize("page", words or PAGES)
-
-
-@pages()
-def test_files_that_a_page_names_exist(page: str) -> None:
-    named = {word for word in code(text(page)) if re.fullmatch(r"[\w./-]+", word)}
-    kept = ("tests/", "tdanet_jax/", "experiments/", "assets/", "agents/18", "notebooks/")
-    missing = [word for word in named if word.startswith(kept) and not (ROOT / word).exists()]
-    tests = re.findall(r"pytest -m slow (\S+?)[\s`]", text(page))
-    assert missing + [path for path in tests if not (ROOT / path).exists()] == []
-
-
-@pages()
-def test_modules_that_a_page_runs_exist(page: str) -> None:
-    for module in re.findall(r"python -m ([\w.]+)", text(page)):
-        assert importlib.util.find_spec(module) is not None, module
-
-
-@pages()
-def test_names_of_the_package_that_a_page_mentions_exist(page: str) -> None:
-    for name in re.findall(r"`tdanet_jax\.([\w.]+)", text(page)):
-        found: Any = importlib.import_module("tdanet_jax")
-        path = "tdanet_jax"
-        for part in name.split("."):
-            path = f"{path}.{part}"
-            if not hasattr(found, part):
-                importlib.import_module(path)
-            found = getattr(found, part)
-
-
-@pytest.fixture(scope="module")
-def flags() -> set[str]:
-    """The flags of all commands, as their help shows them."""
-    known = set()
-    for command in COMMANDS:
-        name, *rest = command.split()
-        said = io.StringIO()
-        with contextlib.redirect_stdout(said), pytest.raises(SystemExit):
-            importlib.import_module(f"experiments.{name}").main([*rest, "--help"])
-        known |= set(re.findall(r"--[a-z][\w-]*", said.getvalue()))
-    return known
-
-
-@pages()
-def test_flags_that_a_page_mentions_exist(page: str, flags: set[str]) -> None:
-    assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text(page))) - flags - FOREIGN == set()
 
 
 def test_fields_of_the_results() -> None:

@@ -45,7 +45,7 @@ def small_runs(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_blocks_of_a_page_run(
     page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One after the other, as a reader would type them; where an agent is needed, the bundled one."""
+    """One after the other, as a reader would type them; `runs/A` is the bundled agent."""
     shutil.copytree(ROOT / "agents", tmp_path / "agents")
     shutil.copytree(ROOT / "agents" / "18-4-best", tmp_path / "runs" / "A")
     monkeypatch.chdir(tmp_path)

@@ -1,0 +1,80 @@
+"""Files, modules, names and flags that the pages mention exist."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import importlib.util
+import io
+import re
+from typing import Any
+
+import pytest
+
+from tests.support.pages import PAGES, ROOT, prose
+
+COMMANDS = (
+    "attention", "benchmark", "evaluate", "replay", "scaling", "scenes verify", "scenes inspect",
+    "scenes build", "scenes import", "scenes export", "scenes collect", "share", "sweep",
+    "train_zero_shot", "trajectories",
+)  # fmt: skip
+#: Flags of other programs that the pages mention.
+FOREIGN = {"--check", "--fix", "--xla_gpu_deterministic_ops", "--help"}
+#: Where the files are that a page may name.
+FOLDERS = (
+    "tests/", "tdanet_jax/", "experiments/", "docs/", "assets/", "agents/18", "notebooks/", ".ci/"
+)  # fmt: skip
+
+pages = pytest.mark.parametrize("page", PAGES)
+
+
+def code(page: str) -> list[str]:
+    """What stands between single backticks, outside of blocks."""
+    return re.findall(r"`([^`]+)`", prose(page))
+
+
+@pages
+def test_files_that_a_page_names_exist(page: str) -> None:
+    named = {word for word in code(page) if re.fullmatch(r"[\w./-]+", word)}
+    missing = [word for word in named if word.startswith(FOLDERS) and not (ROOT / word).exists()]
+    assert missing == []
+
+
+@pages
+def test_modules_that_a_page_runs_exist(page: str) -> None:
+    for module in re.findall(r"python -m ([\w.]+)", (ROOT / page).read_text()):
+        assert importlib.util.find_spec(module) is not None, module
+
+
+@pages
+def test_names_of_the_package_that_a_page_mentions_exist(page: str) -> None:
+    names = re.findall(r"`(tdanet_jax\.[\w.]+)", prose(page))
+    reference = re.findall(r"^::: ([\w.]+)|#(tdanet_jax\.[\w.]+)\)", prose(page), re.MULTILINE)
+    for name in [*names, *(one or other for one, other in reference)]:
+        found: Any = importlib.import_module("tdanet_jax")
+        path = "tdanet_jax"
+        for part in name.split(".")[1:]:
+            path = f"{path}.{part}"
+            if not hasattr(found, part):
+                importlib.import_module(path)
+            found = getattr(found, part)
+
+
+@functools.cache
+def flags() -> set[str]:
+    """The flags of all commands, as their help shows them."""
+    known = set()
+    for command in COMMANDS:
+        name, *rest = command.split()
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), pytest.raises(SystemExit):
+            importlib.import_module(f"experiments.{name}").main([*rest, "--help"])
+        known |= set(re.findall(r"--[a-z][\w-]*", said.getvalue()))
+    return known
+
+
+@pages
+def test_flags_that_a_page_mentions_exist(page: str) -> None:
+    text = "\n".join(code(page))
+    assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text)) - flags() - FOREIGN == set()
