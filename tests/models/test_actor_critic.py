@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from tdanet_jax.env.types import Observation
+from tdanet_jax.models import actor_critic
 from tdanet_jax.models.activation_cache import ACTIVATIONS
-from tdanet_jax.models.actor_critic import ActorCritic, Output
+from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
 from tdanet_jax.models.lstm import Carry
 from tdanet_jax.models.tdanet import TDANetEncoder
 from tests.support import equations, samples
@@ -167,6 +168,93 @@ def test_the_past_matters(part: str) -> None:
     first = forward(parameters(), carry, obs, prev_action_probs, stale, dropout_mask)[1]
     second = forward(parameters(), other_carry, obs, other_probs, stale, dropout_mask)[1]
     assert not np.allclose(first.logits, second.logits)
+
+
+class Steps(NamedTuple):
+    """What `actor_critic.act` is given and gives in T steps, [T, ...]."""
+
+    is_first: jax.Array
+    prev_action_probs: jax.Array
+    out: Output
+    activations: Any
+    attention: jax.Array
+
+
+def acted(weights: Any) -> tuple[RecurrentState, RecurrentState, Steps]:
+    """T steps, one at a time, of which some begin an episode: the states around them, and they."""
+    module = network()
+    _, obs, *_, dropout_mask = inputs()
+    done = inputs()[3]
+    class_table = actor_critic.prepare(module, weights, WORDS)
+
+    def step(state: RecurrentState, given: Any) -> tuple[RecurrentState, Steps]:
+        obs, mask, done = given
+        after, out, kept = actor_critic.act(
+            module, weights, class_table, state, obs, mask, (ACTIVATIONS, "intermediates")
+        )
+        (attention,) = kept["intermediates"]["attention"]
+        steps = Steps(state.is_first, state.prev_action_probs, out, kept[ACTIVATIONS], attention)
+        return after.restarted(done), steps
+
+    start = actor_critic.initial_state(module, weights, B)
+    after, steps = jax.lax.scan(step, start, (obs, dropout_mask, done))
+    return start, after, steps
+
+
+def test_acting_step_by_step_is_the_forward_pass_over_the_rollout() -> None:
+    weights, (_, obs, *_, dropout_mask) = parameters(), inputs()
+    start, after, steps = jax.jit(acted)(weights)
+    assert steps.is_first[0].all()
+    assert not steps.is_first.all()
+    assert steps.is_first[1:].any()
+    given = (obs, steps.prev_action_probs, steps.is_first, dropout_mask)
+    carry, out = forward(weights, start.carry, *given)
+    chex.assert_trees_all_close((after.carry, steps.out), (carry, out), **CLOSE)
+    class_table = actor_critic.prepare(network(), weights, WORDS)
+    cached = actor_critic.forward(
+        network(), weights, class_table, start.carry, *given, activations=steps.activations
+    )
+    chex.assert_trees_all_close(cached, (carry, out), **CLOSE)
+    # The next step is given the probabilities of this one, or zeros where an episode begins.
+    probs = jnp.where(steps.is_first[1:, :, None], 0.0, jax.nn.softmax(steps.out.logits)[:-1])
+    np.testing.assert_allclose(steps.prev_action_probs[1:], probs, rtol=1e-6)
+    assert not steps.prev_action_probs[0].any()
+
+
+def test_the_attention_of_a_step_is_the_encoders() -> None:
+    weights, (_, obs, *_) = parameters(), inputs()
+    *_, steps = acted(weights)
+    module = network()
+    class_table = actor_critic.prepare(module, weights, WORDS)
+    encoder = {"params": weights["encoder"]}
+    expected = module.encoder.apply(encoder, class_table, obs, method="attend")
+    assert steps.attention.shape == obs.mask.shape
+    np.testing.assert_allclose(steps.attention, expected, **CLOSE)
+    np.testing.assert_allclose(steps.attention.sum(-1), 1, rtol=1e-5)
+
+
+def test_a_step_gives_only_the_collections_that_it_is_asked_for() -> None:
+    weights, (_, obs, *_) = parameters(), inputs()
+    module, obs = network(), jax.tree.map(lambda x: x[0], obs)
+    class_table = actor_critic.prepare(module, weights, WORDS)
+    state = actor_critic.initial_state(module, weights, B)
+    found = [
+        actor_critic.act(module, weights, class_table, state, obs, collections=names)
+        for names in ((), (ACTIVATIONS,), ("intermediates",))
+    ]
+    assert [set(kept) for *_, kept in found] == [set(), {ACTIVATIONS}, {"intermediates"}]
+    for after, out, _ in found[1:]:
+        chex.assert_trees_all_equal((after, out), found[0][:2])
+
+
+def test_a_new_episode_begins_without_a_previous_action_and_others_continue() -> None:
+    carry, _, prev_action_probs, *_ = inputs()
+    state = RecurrentState(carry, prev_action_probs[0] + 0.1, jnp.zeros(B, bool))
+    after = state.restarted(jnp.array([True, False]))
+    assert after.is_first.tolist() == [True, False]
+    assert not after.prev_action_probs[0].any()
+    np.testing.assert_array_equal(after.prev_action_probs[1], state.prev_action_probs[1])
+    chex.assert_trees_all_equal(after.carry, carry)  # the LSTM clears it by `is_first`
 
 
 def test_the_published_size() -> None:

@@ -92,3 +92,17 @@ def test_the_sensors_follow_the_encoders_features_and_leave_them_alone(
     layer = weights["sensor_embedding"]
     expected = np.maximum(suite.features(spec, readings) @ layer["kernel"] + layer["bias"], 0)
     np.testing.assert_allclose(features[..., alone.shape[-1] :], expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("readings", "missing"),
+    [({}, "'odometry', 'triangulation'"), (samples.readings(B), "'triangulation'")],
+)
+def test_observations_without_the_networks_sensors_are_refused_by_name(
+    readings: Any, missing: str
+) -> None:
+    spec = ObservationSpec(sensors=("odometry", "triangulation"))
+    obs = samples.observations(B).replace(sensors=readings)
+    inputs = WORDS, obs, jnp.zeros((B, 6)), None
+    with pytest.raises(ValueError, match=rf"lack what the network senses: \[{missing}\]"):
+        ActorCritic(Plain(), spec=spec).apply({"params": {}}, *inputs, method="perceive")
