@@ -33,7 +33,7 @@ def test_paper_preset_has_the_reference_constants():
         (TrainConfig(split="Mug,CD,Mug"), "--split Mug,CD,Mug: Mug is given twice"),
         (
             TrainConfig(split="Painting,Laptop,Television,RemoteControl,Vase", validation=True),
-            "leaves no class to train on in living_room beside the one that --validation holds out",
+            "leaves no class to train on in living_room besides the one that --validation holds out",
         ),
         (TrainConfig(model="cnn"), "--model cnn"),
         (TrainConfig(steps=0), "--steps 0"),
@@ -50,7 +50,7 @@ def test_paper_preset_has_the_reference_constants():
         ),
         (
             TrainConfig(network=NetworkConfig(odometry=True, triangulation=True, rows="class")),
-            "--rows class: --triangulation needs",
+            "--triangulation: needs a box of every object, which --rows class does not show",
         ),
         (TrainConfig(learner=LearnerConfig(size_noise=-0.1)), "--size-noise -0.1: must be between"),
         (TrainConfig(learner=LearnerConfig(size_noise=2.1)), "--size-noise 2.1: must be between"),
@@ -135,14 +135,14 @@ def test_a_paper_run_ends_with_the_first_of_its_budgets():
     assert dataclasses.replace(PAPER, steps=100).spent(100, 3, 1.0) == 1.0
 
 
-def test_a_run_of_a_model_of_ones_own_is_read_only_by_those_who_trust_it(tmp_path, monkeypatch):
+def test_a_run_of_a_custom_model_is_read_only_by_those_who_trust_it(tmp_path, monkeypatch):
     path, config = tmp_path / "config.json", TrainConfig(model="some_lab.agent")
     configs.save(config, path)
     with pytest.raises(ValueError, match=r"set TDANET_TRUST=some_lab\.agent") as caught:
         configs.load(path)
     assert str(path) in str(caught.value)
     monkeypatch.setenv(configs.TRUST, "another_lab.agent")
-    with pytest.raises(ValueError, match="code of somebody's own"):
+    with pytest.raises(ValueError, match="its model is custom code, some_lab"):
         configs.load(path)
     monkeypatch.setenv(configs.TRUST, "another_lab.agent,some_lab.agent")
     assert configs.load(path) == config
