@@ -33,7 +33,7 @@ def test_paper_preset_has_the_reference_constants():
         (TrainConfig(split="Mug,CD,Mug"), "--split Mug,CD,Mug: Mug is given twice"),
         (
             TrainConfig(split="Painting,Laptop,Television,RemoteControl,Vase", validation=True),
-            "leaves no class to train on in living_room besides the one that --validation holds out",
+            "no class to train on in living_room besides the one that --validation holds out",
         ),
         (TrainConfig(model="cnn"), "--model cnn"),
         (TrainConfig(steps=0), "--steps 0"),
