@@ -63,7 +63,8 @@ class ActorCritic(nn.Module):
 
     def setup(self) -> None:
         if self.spec.sensors:
-            self.sensor_embedding = Linear(SENSOR_UNITS)
+            # Its name in files enters its initial random values: with another, seeds would change.
+            self.sensor_embedding = Linear(SENSOR_UNITS, name="way")
         if self.encoder.ACTION != "plain":
             self.action_embedding = Linear(self.action_width)
         self.lstm = LSTM(self.hidden, self.dtype)

@@ -89,7 +89,7 @@ def test_the_sensors_follow_the_encoders_features_and_leave_them_alone(
     assert skip_inputs.shape == (2, B, 6)
     assert features.shape == (2, B, alone.shape[-1] + SENSOR_UNITS)
     np.testing.assert_array_equal(features[..., : alone.shape[-1]], alone)
-    layer = weights["sensor_embedding"]
+    layer = weights["way"]
     expected = np.maximum(suite.features(spec, readings) @ layer["kernel"] + layer["bias"], 0)
     np.testing.assert_allclose(features[..., alone.shape[-1] :], expected, rtol=1e-4, atol=1e-5)
 

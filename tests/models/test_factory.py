@@ -94,7 +94,7 @@ def test_every_named_model_takes_sensors(name: str, triangulation: bool) -> None
         jax.eval_shape(answer, obs.replace(sensors={}))
     weights, out = jax.eval_shape(answer, obs)
     assert out.logits.shape == (2, B, 6)
-    kernel = weights["sensor_embedding"]["kernel"]
+    kernel = weights["way"]["kernel"]
     assert kernel.shape == (741 + 9 * triangulation, SENSOR_UNITS)
 
 
@@ -117,7 +117,7 @@ def test_every_named_model_learns_with_sensors(
     state, metrics = chunk(state, jnp.zeros(2), task.train_words, task.train_params)
     assert int(state.skipped) == 0
     chex.assert_tree_all_finite((state.params, metrics))
-    after, before = (x["sensor_embedding"]["kernel"] for x in (state.params, before))
+    after, before = (x["way"]["kernel"] for x in (state.params, before))
     assert not np.array_equal(after, before)
 
 

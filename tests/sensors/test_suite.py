@@ -200,7 +200,7 @@ def test_a_custom_sensor_is_trained_with(some_rooms: SceneTables, glove: WordVec
     assert task.train_params.spec == task.eval_params.spec == task.spec
     known = task.train_words, task.train_params
     state = learner.init(jax.random.key(0), config.learner, task.model, *known)
-    before = np.asarray(state.params["sensor_embedding"]["kernel"])
+    before = np.asarray(state.params["way"]["kernel"])
     assert before.shape[0] == 741 + 4
     _, steps, _ = learner.rollout(state, jax.random.key(1), config.learner, task.model, *known)
     counts = jax.device_get(steps.obs.sensors[step_counter.NAME])
@@ -214,7 +214,7 @@ def test_a_custom_sensor_is_trained_with(some_rooms: SceneTables, glove: WordVec
     state, metrics = chunk(state, jnp.zeros(2), *known)
     assert int(state.skipped) == 0
     chex.assert_tree_all_finite((state.params, metrics))
-    change = np.abs(np.asarray(state.params["sensor_embedding"]["kernel"]) - before)
+    change = np.abs(np.asarray(state.params["way"]["kernel"]) - before)
     assert (change[-4:].max(axis=1) > 0).all(), "every feature of the sensor should be learnt from"
 
 

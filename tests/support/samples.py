@@ -78,7 +78,7 @@ def parameters(model: ActorCritic, words: Any, seed: int = 2) -> Any:
 def moving_by_odometry(model: ActorCritic, words: Any) -> Any:
     """Random parameters of a network with odometry that mostly moves ahead and rarely ends."""
     weights = parameters(model, words)
-    weights["sensor_embedding"]["kernel"] *= 5.0  # most of its inputs are zero
+    weights["way"]["kernel"] *= 5.0  # most of its inputs are zero
     weights["actor"]["bias"] = jnp.array([2.0, 0.0, 0.0, 0.0, 0.0, -1.0])
     return weights
 

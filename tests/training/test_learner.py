@@ -242,8 +242,8 @@ def test_the_activation_cache_changes_neither_the_loss_nor_its_gradient(sensors:
     # float32 sums over 240 states, in another order.
     chex.assert_trees_all_close(cached, plain, rtol=2e-4, atol=2e-6)
     if sensors:
-        assert "sensor_embedding" in steps.activations
-        assert all(np.asarray(grad).any() for grad in cached[1]["sensor_embedding"].values())
+        assert "way" in steps.activations
+        assert all(np.asarray(grad).any() for grad in cached[1]["way"].values())
 
 
 def test_sensor_states_begin_with_every_episode_and_last_as_long_as_it() -> None:

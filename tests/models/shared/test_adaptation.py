@@ -160,7 +160,7 @@ def slow_rollout(params: Any, given: Any, first_order: bool = False, **network: 
 
 
 #: The layer that is not adapted.
-NOT_ADAPTED = ("sensor_embedding",)
+NOT_ADAPTED = ("way",)
 
 
 @pytest.mark.parametrize("odometry", [False, True], ids=["plain", "odometry"])
