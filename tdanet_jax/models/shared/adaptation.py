@@ -171,7 +171,8 @@ class AdaptiveActorCritic(ActorCritic):
 
     def view(self, obs: Observation) -> Observation:
         """The part of the observations that the network uses, in shapes equal for all frames."""
-        sensors = {name: obs.sensors[name] for name in self.spec.sensors}
+        names = self.spec.sensors
+        sensors = {name: reading for name, reading in obs.sensors.items() if name in names}
         return self.encoder.view(obs).replace(sensors=sensors)
 
     def inner_loss(self, hidden: jax.Array) -> jax.Array:
