@@ -21,9 +21,8 @@ from tdanet_jax import words as word_vectors
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.env.types import Observation
 from tdanet_jax.models import actor_critic
-from tdanet_jax.models import classes as vocabularies
 from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
-from tdanet_jax.models.classes import ClassVocabulary
+from tdanet_jax.models.classes import ClassVocabulary, load_vocabulary
 from tdanet_jax.models.factory import make_model
 from tdanet_jax.poses import ROTATIONS
 from tdanet_jax.sensors import suite
@@ -267,4 +266,4 @@ def read(run: Path | str) -> tuple[TrainConfig, Any, ClassVocabulary]:
     folder = path.parent.parent if point else path
     config = configs.load(folder / CONFIG_FILE)
     snapshot = history.read(path) if point else newest(folder)
-    return config, snapshot.weights, vocabularies.load(folder)
+    return config, snapshot.weights, load_vocabulary(folder)
