@@ -189,7 +189,8 @@ def tables_row() -> Row:
     import tempfile
 
     from tdanet_jax.scenes import ithor
-    from tdanet_jax.scenes.tables import SceneTables, build
+    from tdanet_jax.scenes.tables import SceneTables
+    from tdanet_jax.scenes.tabulation import build
 
     began = time.perf_counter()
     tables = build(ithor.load_scenes())

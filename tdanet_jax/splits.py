@@ -149,7 +149,7 @@ def split_name(text: str) -> str:
 
     Args:
       text: "22/0", "18/4" or "14/8"; or the unseen classes in any order, separated by commas:
-      "vase,Mug" is "Mug,Vase", and the four classes of 18/4 are "18/4".
+        "vase,Mug" is "Mug,Vase", and the four classes of 18/4 are "18/4".
 
     Raises:
       ValueError: it describes none; the message says why.

@@ -21,11 +21,12 @@ from tdanet_jax.env.types import EnvParams
 from tdanet_jax.models import class_graph
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary, make_vocabulary
-from tdanet_jax.models.registry import make_model, resolve_precision
+from tdanet_jax.models.factory import make_model, resolve_precision
 from tdanet_jax.observation_spec import ObservationSpec
-from tdanet_jax.scenes.dataset import Extras, Rooms, load_rooms, with_own_rooms
-from tdanet_jax.scenes.offline import importer
-from tdanet_jax.scenes.tables import Progress, SceneTables
+from tdanet_jax.scenes.dataset import Extras, Rooms, assign_rooms, load_rooms
+from tdanet_jax.scenes.offline.features import features_path, load_features
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.splits import Split, make_split
 from tdanet_jax.vocabulary import ROOM_TYPES
 from tdanet_jax.words import WordVectors
@@ -143,7 +144,7 @@ def task_in(rooms: Rooms, config: TrainConfig) -> Task:
     data = None if rooms.path is None else str(rooms.path)
     config, features = resolve(dataclasses.replace(config, data=data)), None
     if rooms.path is not None and config.network.image == "features":
-        features = importer.load_features(rooms.path, rooms.tables)
+        features = load_features(rooms.path, rooms.tables)
     try:
         return make_task(config, rooms.tables, vectors, rooms.extras, features)
     except ValueError as error:
@@ -175,7 +176,7 @@ def make_task(
         model needs feature maps and there are none.
     """
     split = make_split(config.split, config.validation)
-    split = with_own_rooms(split, Rooms(tables, extras), config.validation)
+    split = assign_rooms(split, Rooms(tables, extras), config.validation)
     split = split.within(tables.scenes, tables.classes)
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
     adjacency = None if extras is None else extras.class_graph(tables.classes)
@@ -187,7 +188,7 @@ def make_task(
     train_words = zero_shot.hide_words(words, tables.classes, split.hidden)
     parents = _parents(seen_rooms, split, extras)
     trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]
-    train_maps, eval_maps = _feature_maps(model, features, trains)
+    train_maps, eval_maps = _feature_maps(config.model, model, features, trains)
     rewarded = config.learner.partial_reward
     similarity = None
     if rewarded == "similarity":
@@ -223,13 +224,13 @@ def make_task(
 
 
 def _feature_maps(
-    model: ActorCritic, features: np.ndarray | None, trains: np.ndarray
+    name: str, model: ActorCritic, features: np.ndarray | None, trains: np.ndarray
 ) -> tuple[FeatureMaps | None, FeatureMaps | None]:
     """The maps for the training positions [P] bool, and for all; none if the model needs none."""
     if not model.encoder.maps:
         return None, None
     if features is None:
-        raise ValueError("the model needs ResNet-18's feature maps, and these rooms have none")
+        raise ValueError(f"{name} needs ResNet-18's feature maps, and these rooms have none")
     flat = features.reshape(*features.shape[:2], -1).swapaxes(1, 2)  # cells before channels
     maps = jnp.asarray(np.ascontiguousarray(flat))  # shared by both: nothing is copied
     chosen = (np.flatnonzero(trains), np.arange(len(trains)))
@@ -248,6 +249,6 @@ def resolve(config: TrainConfig) -> TrainConfig:
     """The configuration with every "auto" replaced by what suits this machine and the data."""
     network = resolve_precision(config.network)
     if network.image == "auto":
-        imported = config.data is not None and importer.features_path(Path(config.data)).is_file()
+        imported = config.data is not None and features_path(Path(config.data)).is_file()
         network = dataclasses.replace(network, image="features" if imported else "raster")
     return dataclasses.replace(config, network=network)

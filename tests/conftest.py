@@ -78,7 +78,7 @@ def some_rooms(ithor: SceneTables) -> SceneTables:
 def rooms_file(some_rooms: SceneTables, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same eight rooms in a file, for `--data`."""
     path = tmp_path_factory.mktemp("rooms") / "rooms.npz"
-    dataset.save(Rooms(some_rooms, None), path)
+    dataset.save_rooms(Rooms(some_rooms, None), path)
     return path
 
 

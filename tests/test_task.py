@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
-from tdanet_jax.models.registry import MODELS
 from tdanet_jax.env import dynamics
-from tdanet_jax.models.classes import Classes
-from tdanet_jax.scenes.offline import importer
+from tdanet_jax.models.classes import ClassVocabulary
+from tdanet_jax.models.factory import make_model, unused_flags
+from tdanet_jax.registry import MODELS
+from tdanet_jax.scenes.offline.features import features_path
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.models.registry import make_model, unused_flags
 from tdanet_jax.task import make_task, resolve
 from tdanet_jax.words import WordVectors
 
@@ -54,7 +54,7 @@ def test_each_pose_has_its_own_feature_map_in_training_and_in_tests(
         chosen = np.isin(np.array(tables.scenes), scenes)[tables.position_scene]
         position = np.flatnonzero(chosen)
         poses = jnp.arange(16 * len(position), dtype=jnp.int32)
-        state = jax.vmap(dynamics.start, (None, 0, None))(params, poses, jnp.int32(0))
+        state = jax.vmap(dynamics.start, (0, None, None))(poses, jnp.int32(0), params)
         seen = np.asarray(jax.vmap(dynamics.observe, (0, None))(state, params).features)
         assert seen.shape == (len(poses), 49, 2)
         expected = (16 * position[:, None] + np.arange(16)).reshape(-1) % 2048
@@ -64,7 +64,9 @@ def test_each_pose_has_its_own_feature_map_in_training_and_in_tests(
 
 def test_a_model_of_feature_maps_needs_them(ithor: SceneTables, glove: WordVectors) -> None:
     config = TrainConfig(model="baseline", network=dataclasses.replace(SMALL, image="features"))
-    with pytest.raises(ValueError, match="baseline looks at feature maps, and these rooms have no"):
+    with pytest.raises(
+        ValueError, match="baseline needs ResNet-18's feature maps, and these rooms have none"
+    ):
         make_task(config, rooms(ithor), glove)
 
 
@@ -80,7 +82,7 @@ def test_a_model_that_numbers_classes_is_kept_from_others(
         with (
             contextlib.nullcontext()
             if not numbered
-            else pytest.raises(ValueError, match="runs/a: the model knows classes by their number")
+            else pytest.raises(ValueError, match="runs/a: the model knows classes by their index")
         ):
             task.check_known("runs/a", tables.classes[1:])
 
@@ -91,45 +93,44 @@ def test_models_without_an_image_are_shown_none(ithor: SceneTables, glove: WordV
     assert task.train_params.features is None
 
 
-@pytest.mark.parametrize(("senses", "sights"), [(False, False), (True, False), (True, True)])
+@pytest.mark.parametrize("sensors", [(), ("odometry",), ("odometry", "triangulation")])
 def test_odometry_and_triangulation_reach_the_network_and_both_environments(
-    ithor: SceneTables, glove: WordVectors, senses: bool, sights: bool
+    ithor: SceneTables, glove: WordVectors, sensors: tuple[str, ...]
 ) -> None:
-    network = dataclasses.replace(SMALL, odometry=senses, triangulation=sights)
-    task = make_task(TrainConfig(network=network), rooms(ithor), glove)
-    assert (task.model.odometry, task.model.triangulation) == (senses, sights)
+    flags = dict.fromkeys(sensors, True)
+    task = make_task(TrainConfig(network=dataclasses.replace(SMALL, **flags)), rooms(ithor), glove)
+    assert task.spec.sensors == task.model.spec.sensors == sensors
     for params in (task.train_params, task.eval_params):
-        assert (params.odometry, params.triangulation) == (senses, sights)
+        assert params.spec == task.spec
         obs, state = jax.eval_shape(dynamics.reset, jax.random.key(0), params)
-        assert (obs.odometry is not None) == (state.trail is not None) == senses
-        if senses:
-            assert (obs.odometry.target is not None) == sights
-            assert (state.trail.sighting is not None) == sights
+        assert tuple(obs.sensors) == tuple(state.sensors) == sensors
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_that_is_not_shown_every_object_cannot_triangulate(name: str) -> None:
     """In one line that says what to do instead."""
     network = dataclasses.replace(SMALL, image="raster", odometry=True, triangulation=True)
-    config, classes = TrainConfig(model=name, network=network), Classes(("Mug", "Sink"), (0, 1))
+    config = TrainConfig(model=name, network=network)
+    classes = ClassVocabulary(("Mug", "Sink"), (0, 1))
     if name.startswith("tdanet"):
-        assert make_model(config, classes).triangulation
+        assert make_model(config, classes).spec.sensors == ("odometry", "triangulation")
         return
     message = (
-        f"^--triangulation: {name} is not shown a box of every object; use --no-triangulation$"
+        f"^--triangulation: needs a box of every object, which {name} does not show; "
+        "use --no-triangulation$"
     )
     with pytest.raises(ValueError, match=message):
         make_model(config, classes)
     alone = dataclasses.replace(network, triangulation=False)
     model = make_model(dataclasses.replace(config, network=alone), classes)
-    assert (model.odometry, model.triangulation) == (True, False)
+    assert model.spec.sensors == ("odometry",)
 
 
 def test_auto_takes_the_feature_maps_that_lie_beside_the_data(tmp_path) -> None:
     data = tmp_path / "mine.npz"
     config = TrainConfig(model="baseline", network=SMALL, data=str(data))
     assert resolve(config).network.image == "raster"
-    importer.features_path(data).write_bytes(b"maps")
+    features_path(data).write_bytes(b"maps")
     assert resolve(config).network.image == "features"
     assert resolve(TrainConfig(network=SMALL)).network.image == "raster"
     chosen = dataclasses.replace(SMALL, image="raster")
@@ -164,7 +165,7 @@ def test_feature_maps_need_imported_rooms() -> None:
 )
 def test_flags_that_change_nothing_are_named(model, network, idle) -> None:
     config = TrainConfig(model=model, network=network)
-    assert sorted(unused_flags(config, Classes())) == sorted(idle)
+    assert sorted(unused_flags(config, ClassVocabulary())) == sorted(idle)
 
 
 @pytest.mark.parametrize("model", ["tdanet", "ssnet", "baseline"])
@@ -173,4 +174,4 @@ def test_size_noise_changes_nothing_for_a_model_of_images(model: str) -> None:
     for noise in (0.0, 0.5):
         config = TrainConfig(model=model, network=network, learner=LearnerConfig(size_noise=noise))
         idle = ["--size-noise"] if noise and model == "baseline" else []
-        assert unused_flags(config, Classes()) == idle
+        assert unused_flags(config, ClassVocabulary()) == idle

@@ -1,4 +1,4 @@
-"""Rooms: their objects and reachable points, and the tables that an agent's world is made of."""
+"""Rooms: objects and reachable points, and the scene tables that are computed from them."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Tables are computed once per machine and kept in the user's cache folder.
+"""The cache of the bundled rooms' tables, which are computed once per machine.
 
-A cached file's name holds a hash of everything that it follows from: the bundled rooms and the
-source of the modules that compute the tables. Files appear whole or not at all, and of processes
-that find none at the same time one computes while the others wait.
+The name of a cached file contains a hash of everything that determines it: the bundled rooms and
+the source of the modules that compute the tables. Files are written atomically, and if several
+processes need the tables at the same time, one computes them while the others wait.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from pathlib import Path
 import platformdirs
 
 from tdanet_jax.io import assets, files
-from tdanet_jax.scenes import ithor, tables
+from tdanet_jax.scenes import ithor, tabulation
+from tdanet_jax.scenes.tables import SceneTables
 
 VARIABLE = "TDANET_CACHE"
-#: What nobody has used for so long is removed when new tables are stored.
-FORGOTTEN_DAYS = 30
-#: Names of the tables, and of the folders in which imports keep their parts.
+#: Files that have not been used for this long are removed when new tables are stored.
+UNUSED_DAYS = 30
+#: Prefixes of tables, and of the folders in which an import keeps the scenes that it has read.
 TABLES, IMPORTS = "ithor-", "import-"
 _MODULES = (
     "io.archive",
@@ -39,18 +40,19 @@ _MODULES = (
     "scenes.visibility.raster",
     "scenes.visibility.build",
     "scenes.tables",
+    "scenes.tabulation",
     "scenes.ithor",
 )
 
 
 def folder() -> Path:
-    """The cache folder: `TDANET_CACHE` if set, else the platform's own place for caches."""
+    """The cache folder: `TDANET_CACHE` if set, otherwise the platform's folder for caches."""
     chosen = os.environ.get(VARIABLE)
     return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("tdanet_jax"))
 
 
 def key() -> str:
-    """Hash of what the bundled tables follow from, 16 hex digits."""
+    """Hash of everything that determines the bundled tables, 16 hex digits."""
     digest = hashlib.sha256(assets.sha256(assets.path(ithor.ASSET)).encode())
     for name in _MODULES:
         module = importlib.import_module(f"tdanet_jax.{name}")
@@ -58,11 +60,10 @@ def key() -> str:
     return digest.hexdigest()[:16]
 
 
-def load_tables(progress: tables.Progress | None = None) -> tables.SceneTables:
-    """The bundled rooms' tables, from the cache or computed and cached.
+def load_tables(progress: tabulation.Progress | None = None) -> SceneTables:
+    """The tables of the bundled rooms, from the cache, or computed and then cached.
 
-    A cached file whose checksum is wrong is rebuilt with a warning. Where the cache cannot be
-    written the tables are computed all the same.
+    Warns if a cached file is damaged, which is then replaced, and if the cache cannot be written.
     """
     path = folder() / f"{TABLES}{key()}.npz"
     if (found := _read(path)) is not None:
@@ -72,18 +73,18 @@ def load_tables(progress: tables.Progress | None = None) -> tables.SceneTables:
         if (found := _read(path)) is not None:
             return found
         if path.exists():
-            warnings.warn(f"{path}: damaged, computed anew", stacklevel=2)
-        result = tables.build(ithor.load_scenes(), progress=progress)
+            warnings.warn(f"{path}: damaged, computed again", stacklevel=2)
+        result = tabulation.build(ithor.load_scenes(), progress=progress)
         try:
             _store(result, path)
-            _remove_forgotten(path.parent)
+            _remove_unused(path.parent)
         except OSError as error:
             warnings.warn(f"{path}: not cached ({error.strerror})", stacklevel=2)
     return result
 
 
 def _lock(stack: contextlib.ExitStack) -> None:
-    """Makes other processes wait until `stack` unwinds; where nothing can be written, none need."""
+    """Locks the cache until `stack` unwinds, unless the cache cannot be written."""
     try:
         stack.enter_context(files.locked(folder()))
     except BlockingIOError:
@@ -94,29 +95,29 @@ def _lock(stack: contextlib.ExitStack) -> None:
     files.remove_partial(folder())
 
 
-def _read(path: Path) -> tables.SceneTables | None:
-    """The cached tables, or None if they are missing or not those whose checksum was written."""
+def _read(path: Path) -> SceneTables | None:
+    """The cached tables, or None if they are missing or their checksum is wrong."""
     try:
         if path.with_suffix(".sha256").read_text(errors="replace").strip() == assets.sha256(path):
             touch(path)
-            return tables.SceneTables.load(path)
+            return SceneTables.load(path)
     except OSError:
         pass
     return None
 
 
 def touch(path: Path) -> None:
-    """Marks a file or folder of the cache as used now; where it cannot be written, it is not."""
+    """Marks a file or folder of the cache as used now, if it can be written."""
     with contextlib.suppress(OSError):
         os.utime(path)
 
 
-def _remove_forgotten(place: Path) -> None:
-    """Removes tables and parts of imports that nobody has used for long. Under the lock.
+def _remove_unused(place: Path) -> None:
+    """Removes tables and scenes of imports that have not been used for long; holds the lock.
 
-    A process that reads them has them open, or computes anew what it does not find.
+    A process that reads them has them open, or computes again what it does not find.
     """
-    oldest = time.time() - FORGOTTEN_DAYS * 86400
+    oldest = time.time() - UNUSED_DAYS * 86400
     for path in [*place.glob(f"{TABLES}*.npz"), *place.glob(f"{IMPORTS}*")]:
         with contextlib.suppress(OSError):
             if path.stat().st_mtime >= oldest:
@@ -128,7 +129,7 @@ def _remove_forgotten(place: Path) -> None:
                 path.with_suffix(".sha256").unlink()
 
 
-def _store(result: tables.SceneTables, path: Path) -> None:
-    with files.replacing(path) as fresh:
-        result.save(fresh)
-        files.write_text(path.with_suffix(".sha256"), assets.sha256(fresh) + "\n")
+def _store(result: SceneTables, path: Path) -> None:
+    with files.replacing(path) as temporary:
+        result.save(temporary)
+        files.write_text(path.with_suffix(".sha256"), assets.sha256(temporary) + "\n")

@@ -1,6 +1,6 @@
-"""Writing a scene file from a running AI2-THOR, for those who have Unity (`pip install ai2thor`).
+"""Scene files from a running AI2-THOR.
 
-The controller is an argument: this module needs neither Unity nor the `ai2thor` package.
+The controller is an argument: this module itself needs neither Unity nor the `ai2thor` package.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ FIELDS = (
 
 
 def collect(controller: Any, rooms: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
-    """Scene documents of AI2-THOR scenes.
+    """The documents of a scene file, one per scene of AI2-THOR.
 
     Args:
-      controller: an `ai2thor.controller.Controller`, or anything with its `reset` and `step`.
+      controller: an `ai2thor.controller.Controller`, or an object with its `reset` and `step`.
       rooms: (AI2-THOR scene name, room type) pairs.
 
     Raises:
-      SceneError: an action failed.
+      SceneError: AI2-THOR reports that an action failed.
     """
     documents = []
     for name, room_type in rooms:
@@ -53,5 +53,5 @@ def collect(controller: Any, rooms: Iterable[tuple[str, str]]) -> list[dict[str,
 
 
 def write_scenes(documents: list[dict[str, Any]], path: Path) -> None:
-    """Write a scene file; an existing file is replaced only once the new one is whole."""
+    """Writes a scene file, atomically; an existing file is replaced."""
     files.write_text(path, json.dumps(documents))

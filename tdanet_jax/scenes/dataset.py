@@ -1,4 +1,4 @@
-"""A file of rooms: tables, and what else came with the data that they were imported from."""
+"""A set of rooms, as commands take it with --data: tables, and extras of imported data."""
 
 from __future__ import annotations
 
@@ -6,22 +6,23 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from tdanet_jax.io import archive, files
 from tdanet_jax.io.untrusted import FileError, npz
-from tdanet_jax.scenes import cache
-from tdanet_jax.scenes.scene import MOST_CLASSES, Scene, SceneObject
-from tdanet_jax.scenes.tables import Progress, SceneTables
+from tdanet_jax.scenes import cache, metadata, tabulation
+from tdanet_jax.scenes.checks.consistency import find_problem
+from tdanet_jax.scenes.errors import SceneError
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.splits import PARTS, TRAIN_SCENES_PER_TYPE, VALIDATION_TRAIN_SCENES_PER_TYPE, Split
 from tdanet_jax.vocabulary import ROOM_TYPES
 
 
 @dataclasses.dataclass(frozen=True)
 class PublishedEpisode:
-    """One entry of the published lists of test episodes."""
+    """An entry of the published lists of test episodes."""
 
     part: str  # "test" or "val"
     scene: str
@@ -34,14 +35,14 @@ class PublishedEpisode:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Extras:
-    """What may come beside the rooms.
+    """What imported data may contain in addition to the rooms.
 
     Attributes:
       parents: room type -> target -> parent -> R_p, the partial reward itself.
       episodes: published test episodes.
       graph_classes: n class names, one for each row of `adjacency`.
-      adjacency: [n, n] float32, the published class graph; [0, 0] if there is none.
-      parts: room -> "train" or "test", for rooms that say it themselves.
+      adjacency: [n, n] float32, the published class graph; [0, 0] without one.
+      parts: room -> "train" or "test", for rooms whose scene file says it.
     """
 
     parents: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(
@@ -53,9 +54,9 @@ class Extras:
     parts: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def class_graph(self, classes: Sequence[str]) -> np.ndarray | None:
-        """The class graph between `classes`: [C, C] float32, or None if there is none.
+        """The class graph between `classes`: [C, C] float32, or None without one.
 
-        Classes that the graph does not know have zero rows and columns.
+        Rows and columns of classes that are not in the graph are zero.
         """
         if not self.graph_classes:
             return None
@@ -69,11 +70,11 @@ class Extras:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rooms:
-    """Tables and what came beside them; nothing does beside the bundled ones.
+    """Scene tables, with the extras of imported data; the bundled rooms have none.
 
     Attributes:
-      path: the file that they were read from, beside which their feature maps lie; None if there
-      is none.
+      path: the file that they were read from, next to which their feature maps are; None if they
+        are not from a file.
     """
 
     tables: SceneTables
@@ -82,18 +83,46 @@ class Rooms:
 
 
 def load_rooms(path: str | Path | None, progress: Progress | None = None) -> Rooms:
-    """The rooms of a file, or the bundled ones.
+    """The rooms of a file that `save_rooms` or `SceneTables.save` wrote; None: the bundled rooms.
 
     Raises:
-      FileError: it is no file of rooms.
+      FileError: the file is missing or broken, or its arrays are inconsistent.
     """
     if path is None:
         return Rooms(cache.load_tables(progress), None)
-    return load(Path(path))
+    path = Path(path)
+    arrays = npz.read(path)
+    try:
+        tables = SceneTables.from_arrays(arrays)
+        problem = find_problem(tables)
+        if problem is not None:
+            raise FileError(path, f"not a file of rooms ({problem})")
+        return Rooms(tables.with_known_targets(), _read_extras(arrays), path)
+    except FileError:
+        raise
+    except Exception as error:  # a missing array, a field of another type, broken JSON
+        raise FileError(path, f"not a file of rooms ({error})") from None
 
 
-def save(rooms: Rooms, path: Path) -> None:
-    """Writes a file of rooms; it appears whole or not at all."""
+load = load_rooms  # its former name
+
+
+def build_rooms(scene_file: Path, progress: Progress | None = None) -> Rooms:
+    """The rooms of a scene file (JSON), see `metadata`.
+
+    Raises:
+      SceneError: the file is broken, or its rooms break a rule.
+    """
+    scenes = metadata.read_scenes(scene_file)
+    try:
+        tables = tabulation.build(scenes, progress=progress)
+    except SceneError as error:
+        raise SceneError(f"{scene_file}: {error}") from None
+    return Rooms(tables, Extras(parts={s.name: s.part for s in scenes if s.part is not None}))
+
+
+def save_rooms(rooms: Rooms, path: Path) -> None:
+    """Writes a file of rooms, atomically."""
     extras = rooms.extras or Extras()
     notes = {
         "parents": extras.parents,
@@ -104,27 +133,8 @@ def save(rooms: Rooms, path: Path) -> None:
     arrays = rooms.tables.to_arrays()
     arrays["extras/notes"] = np.frombuffer(json.dumps(notes).encode(), np.uint8)
     arrays["extras/adjacency"] = extras.adjacency
-    with files.replacing(path) as fresh:
-        archive.write(fresh, arrays, compress=True)
-
-
-def load(path: Path) -> Rooms:
-    """Reads a file of rooms, as `save` or `SceneTables.save` wrote it.
-
-    Raises:
-      FileError: it is no such file, or its numbers contradict each other.
-    """
-    arrays = npz.read(path)
-    try:
-        tables = SceneTables.from_arrays(arrays)
-        problem = find_problem(tables)
-        if problem is not None:
-            raise FileError(path, f"not a file of rooms ({problem})")
-        return Rooms(with_known_targets(tables), _read_extras(arrays), path)
-    except FileError:
-        raise
-    except Exception as error:  # a missing array, a field of another kind, broken JSON
-        raise FileError(path, f"not a file of rooms ({error})") from None
+    with files.replacing(path) as temporary:
+        archive.write(temporary, arrays, compress=True)
 
 
 def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
@@ -136,7 +146,7 @@ def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
         raise ValueError("the class graph does not match its names")
     parts = notes.get("parts", {})  # older files have none
     if not set(parts.values()) <= set(PARTS):
-        raise ValueError(f"a room that is for neither of {', '.join(PARTS)}")
+        raise ValueError(f"a room whose part is neither of {', '.join(PARTS)}")
     return Extras(
         parents={
             str(room): {
@@ -152,12 +162,12 @@ def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
     )
 
 
-def with_own_rooms(split: Split, rooms: Rooms, validation: bool = False) -> Split:
-    """A split, to which the rooms belong that say themselves which part they are for.
+def assign_rooms(split: Split, rooms: Rooms, validation: bool = False) -> Split:
+    """The split, with the rooms for which the data say "train" or "test" in that part.
 
-    Other rooms stay what the split says by their names. With `validation`, those that say "test"
-    are left out, and of those of a room type that say "train" the last fifth, as of iTHOR's, are
-    evaluated.
+    All other rooms stay where the split has them by name. With `validation`, rooms for which the
+    data say "test" are left out, and of those of a room type that say "train" the last fifth is
+    for evaluation, as with iTHOR's rooms.
     """
     tables, parts = rooms.tables, {} if rooms.extras is None else rooms.extras.parts
     train = [name for name in split.train_scenes if name not in parts]
@@ -172,71 +182,3 @@ def with_own_rooms(split: Split, rooms: Rooms, validation: bool = False) -> Spli
         train += mine
         evaluated += rest
     return dataclasses.replace(split, train_scenes=tuple(train), eval_scenes=tuple(evaluated))
-
-
-def as_scene(tables: SceneTables) -> Scene:
-    """The one room of some tables: its points, and its objects with their boxes in metres."""
-    objects = tuple(
-        SceneObject(name, tables.classes[tables.object_class[i]], box.reshape(2, 3))
-        for i, (name, box) in enumerate(zip(tables.object_id, tables.object_box, strict=True))
-    )
-    return Scene(tables.scenes[0], int(tables.room_type[0]), tables.position, objects)
-
-
-def find_problem(tables: SceneTables) -> str | None:
-    """What contradicts the tables' own description, in a few words, or None."""
-    sizes = {
-        "R": len(tables.scenes), "P": len(tables.position), "O": len(tables.object_id),
-        "N": len(tables.row_object), "S": tables.num_states, "G": len(tables.targets),
-        "C": len(tables.classes), "T": len(ROOM_TYPES), "F": tables.image * tables.subpixel + 1,
-    }  # fmt: skip
-    for names in (tables.scenes, tables.classes, tables.targets, tables.object_id):
-        if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
-            return "names that are no text"
-    if min(sizes[letter] for letter in "RPOC") == 0 or len(tables.classes) > MOST_CLASSES:
-        return f"no rooms, positions, objects or classes, or over {MOST_CLASSES} classes"
-    for field, (dtype, shape, low, high) in _FIELDS.items():
-        value: Any = getattr(tables, field)
-        wanted = tuple(sizes.get(size, size) for size in shape)
-        if field == "row_start":
-            wanted = (sizes["S"] + 1,)
-        if not isinstance(value, np.ndarray) or value.dtype != dtype or value.shape != wanted:
-            return f"{field} is not {dtype} {wanted}"
-        if high and value.size and not low <= value.min() <= value.max() < sizes[high]:
-            return f"{field} points outside the tables"
-    starts = tables.row_start
-    if starts[0] != 0 or starts[-1] != sizes["N"] or (np.diff(starts) < 0).any():
-        return "row_start does not divide the rows"
-    if (np.diff(tables.position_scene) < 0).any() or not np.isfinite(tables.position).all():
-        return "positions are not finite or not in the order of the rooms"
-    if len(np.unique(tables.position_scene)) != sizes["R"]:
-        return "a room without positions"
-    return None
-
-
-def with_known_targets(tables: SceneTables) -> SceneTables:
-    """The tables without the targets that none of their classes is."""
-    known = np.array([name in tables.classes for name in tables.targets], bool)
-    return dataclasses.replace(
-        tables,
-        targets=tuple(name for name in tables.targets if name in tables.classes),
-        distance=tables.distance[:, known],
-    )
-
-
-#: Field -> dtype, shape, least value, and the axis that its values are indices of.
-_FIELDS: dict[str, tuple[str, tuple[Any, ...], int, str]] = {
-    "room_type": ("int8", ("R",), 0, "T"),
-    "position": ("float64", ("P", 3), 0, ""),
-    "position_scene": ("int16", ("P",), 0, "R"),
-    "next_position": ("int32", ("P", 8), 0, "P"),
-    "row_start": ("int32", ("S",), 0, ""),
-    "row_object": ("int32", ("N",), 0, "O"),
-    "row_box": ("int16", ("N", 4), -1, "F"),
-    "row_visible": ("bool", ("N",), 0, ""),
-    "object_class": ("int16", ("O",), 0, "C"),
-    "object_scene": ("int16", ("O",), 0, "R"),
-    "object_box": ("float64", ("O", 6), 0, ""),
-    "distance": ("int16", ("S", "G"), 0, ""),
-    "raster": ("int8", ("S", 7, 7), -1, "C"),
-}

@@ -1,4 +1,4 @@
-"""A room from above: its reachable points, and the outlines of its objects."""
+"""Floor plans: the reachable points of a room, and the outlines of its objects from above."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from tdanet_jax.poses import GRID_SIZE
-from tdanet_jax.scenes import dataset, ithor
+from tdanet_jax.scenes import ithor
 from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.scene import Scene
 from tdanet_jax.scenes.tables import SceneTables
@@ -16,14 +16,14 @@ from tdanet_jax.scenes.visibility.geometry import box_frame
 
 @dataclasses.dataclass(frozen=True)
 class FloorPlan:
-    """A room from above, in metres.
+    """A room seen from above, in metres.
 
     Attributes:
       points: [P, 2] reachable (x, z).
       classes: n names of the objects' classes.
       outlines: [n, 4, 2] corners (x, z) of the objects, largest first.
       objects: [n] int, their indices among the objects of the room.
-      extent: least x and z, greatest x and z of all points and corners, and half a grid cell.
+      extent: lowest x and z and highest x and z of all points and corners, plus half a grid cell.
     """
 
     points: np.ndarray
@@ -32,16 +32,20 @@ class FloorPlan:
     objects: np.ndarray
     extent: tuple[float, float, float, float]
 
+    def of_class(self, name: str | None) -> list[int]:
+        """Indices of the outlines of a class."""
+        return [i for i, other in enumerate(self.classes) if other == name]
+
 
 def of_scene(scene: Scene) -> FloorPlan:
-    """The floor plan of a room, without the objects whose boxes are unknown."""
+    """The floor plan of a room, without objects whose boxes are unknown."""
     points = scene.points[:, [0, 2]]
     outlines = np.array([_outline(scene, k) for k in range(len(scene.objects))]).reshape(-1, 4, 2)
     known = np.flatnonzero(np.isfinite(outlines).all(axis=(1, 2)))
     largest_first = np.argsort([-area(outlines[k]) for k in known], kind="stable")
     objects = known[largest_first]
-    everything = np.concatenate([points, outlines[known].reshape(-1, 2)])
-    low, high = everything.min(axis=0) - GRID_SIZE / 2, everything.max(axis=0) + GRID_SIZE / 2
+    corners = np.concatenate([points, outlines[known].reshape(-1, 2)])
+    low, high = corners.min(axis=0) - GRID_SIZE / 2, corners.max(axis=0) + GRID_SIZE / 2
     return FloorPlan(
         points=points,
         classes=tuple(scene.objects[k].object_class for k in objects),
@@ -51,32 +55,35 @@ def of_scene(scene: Scene) -> FloorPlan:
     )
 
 
-def load(tables: SceneTables, name: str) -> FloorPlan:
+def of_room(tables: SceneTables, name: str) -> FloorPlan:
     """The floor plan of a room in these tables.
 
-    Objects of bundled rooms have oriented outlines, others those of their axis-aligned boxes.
+    The outlines are oriented in bundled rooms, and those of axis-aligned boxes in other rooms.
 
     Raises:
       SceneError: there is no such room.
     """
     if name not in tables.scenes:
         raise SceneError(f"{name}: no such room in these tables")
-    room = dataset.as_scene(tables.subset([name]))
+    room = tables.subset([name]).as_scene()
     for bundled in ithor.load_scenes():
         if bundled.name == name and _object_ids(bundled) == _object_ids(room):
             return of_scene(dataclasses.replace(bundled, points=room.points))
     return of_scene(room)
 
 
+load = of_room  # its former name
+
+
 def area(outline: np.ndarray) -> float:
-    """Of a parallelogram [4, 2], in square metres."""
+    """Area of a parallelogram [4, 2], in square metres."""
     a, b, _, d = outline
     (x1, z1), (x2, z2) = b - a, d - a
     return float(abs(x1 * z2 - z1 * x2))
 
 
 def _outline(scene: Scene, k: int) -> np.ndarray:
-    """Corners [4, 2] (x, z) of an object's box; of the oriented box if that stands upright."""
+    """Corners [4, 2] (x, z) of an object's box: of the oriented one if that is upright."""
     item = scene.objects[k]
     origin, edges = box_frame(item.box, item.corners)
     level = edges[np.abs(edges[:, 1]) < 1e-2]

@@ -1,9 +1,9 @@
-"""The 120 iTHOR rooms, from published metadata to one compact file and back.
+"""The 120 iTHOR rooms: built from published metadata into one compact file, and read from it.
 
-Two packages of the Python registry describe the rooms: `procthor` holds AI2-THOR's own object
-metadata of one default frame per room, `alfworld` the reachable points of the 0.25 m grid.
-`build_asset` joins them into `ithor.npz`; `load_scenes` reads that file. The agent's place in a
-default frame is not written down in the metadata: it follows from the distances to all objects.
+Two packages on PyPI describe the rooms: `procthor` contains AI2-THOR's object metadata of one
+default frame per room, `alfworld` the reachable points on the 0.25 m grid. `build_asset` combines
+them into `ithor.npz`, which `load_scenes` reads. The metadata do not say where the agent is in a
+default frame: that follows from its distances to all objects.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from tdanet_jax.splits import SCENE_NUMBERS
 from tdanet_jax.vocabulary import ROOM_TYPES, VISIBILITY_DISTANCE
 
 ASSET = "ithor.npz"
-UNIT = 1e-4  # metres; the file holds whole numbers of tenths of a millimetre
+UNIT = 1e-4  # metres; lengths in the file are whole numbers of this unit
 METADATA = "procthor/databases/ai2thor-object-metadata.json"
 LAYOUT = "alfworld/gen/layouts/{name}-layout.npy"
 
 
 def locate_agent(records: list[dict[str, Any]]) -> np.ndarray:
-    """The agent's position [3] from its `distance` to every object of a frame, metres.
+    """The agent's position [3] in metres, from its `distance` to every object of a frame.
 
     Differences of squared distances are linear in the position; a few Newton steps on the
-    distances themselves then remove what rounding left.
+    distances themselves then remove the error of rounding.
     """
     places = np.array([[r["position"][axis] for axis in "xyz"] for r in records])
     distances = np.array([r["distance"] for r in records])
@@ -57,7 +57,7 @@ def locate_agent(records: list[dict[str, Any]]) -> np.ndarray:
 
 
 def build_asset(procthor_wheel: Path, alfworld_wheel: Path, out_dir: Path) -> Path:
-    """Write `ithor.npz` into `out_dir` from the two wheels; equal wheels give equal bytes."""
+    """Writes `ithor.npz` into `out_dir` from the two wheels; equal wheels give equal bytes."""
     with zipfile.ZipFile(procthor_wheel) as wheel:
         metadata = json.loads(wheel.read(METADATA))
     rooms: list[dict[str, Any]] = []
@@ -92,7 +92,7 @@ def _whole(lengths: Any) -> np.ndarray:
 
 
 def _room(name: str, room_type: int, records: list[dict[str, Any]], layout: np.ndarray) -> Scene:
-    """One room from its metadata and its reachable (x, z)."""
+    """A room from its metadata and its reachable points (x, z)."""
     agent = locate_agent(records)
     grid = np.rint(layout / GRID_SIZE) * GRID_SIZE
     if len(grid) == 0 or np.abs(grid - layout).max() > 1e-3:
@@ -103,7 +103,7 @@ def _room(name: str, room_type: int, records: list[dict[str, Any]], layout: np.n
 
 
 def _room_arrays(scene: Scene) -> dict[str, Any]:
-    """One room as arrays of whole numbers."""
+    """A room as arrays of whole numbers."""
     items = scene.objects
     corners = [item.corners for item in items if item.corners is not None]
     row = {item.object_id: i for i, item in enumerate(items)}
@@ -126,13 +126,13 @@ def _room_arrays(scene: Scene) -> dict[str, Any]:
         "object_is_open": np.array([item.is_open for item in items]),
         "object_pickupable": np.array([item.pickupable for item in items]),
         "object_visible": np.array([bool(item.visible) for item in items]),
-        "object_parents": np.array([len(held) for held in parents], np.int16),
-        "parent": np.array([index for held in parents for index in held], np.int16),
+        "object_parents": np.array([len(rows) for rows in parents], np.int16),
+        "parent": np.array([index for rows in parents for index in rows], np.int16),
     }
 
 
 def _default_rotation(scene: Scene) -> int:
-    """The rotation of the default frame, inferred from the flags of the objects within reach."""
+    """The rotation in the default frame, inferred from the flags of objects within reach."""
     agent = scene.default_position
     assert agent is not None
     origins, edges, visible = [], [], []

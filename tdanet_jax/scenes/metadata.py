@@ -1,17 +1,18 @@
-"""Rooms from AI2-THOR's object metadata: the bundled ones and a user's own.
+"""Rooms from AI2-THOR's object metadata, and scene files, which contain such metadata.
 
-A scene file is JSON: one scene or a list of scenes, each an object with
+A scene file is JSON: a scene or a list of scenes, each an object with
 
-    name                 any name that is not taken twice
+    name                 unique in the file
     room_type            kitchen, living_room, bedroom or bathroom
     objects              controller.last_event.metadata["objects"]
     reachable_positions  the actionReturn of GetReachablePositions, gridSize 0.25
     split                optional, train or test: the part of every split that the room belongs to;
-                         without it the name decides, if it is one of iTHOR's rooms
-    agent                optional, metadata["agent"] at the time: lets the flags be verified
+                         without it the name decides, if it is the name of an iTHOR room
+    agent                optional, metadata["agent"] in the same frame, to verify the flags
 
-Of each object are read objectId, objectType, axisAlignedBoundingBox and, where they are,
-objectOrientedBoundingBox, rotation, openable, isOpen, pickupable, parentReceptacles, visible.
+The fields objectId, objectType and axisAlignedBoundingBox of an object are required;
+objectOrientedBoundingBox, rotation, openable, isOpen, pickupable, parentReceptacles and visible are
+read if present.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from tdanet_jax.splits import PARTS
 from tdanet_jax.vocabulary import IGNORED, ROOM_TYPES
 
 ALIGNED = 0.02  # metres by which a point may miss the grid
-FARTHEST = 1000.0  # metres from the origin; a coordinate beyond is a mistake
+FARTHEST = 1000.0  # metres from the origin; a coordinate beyond this is an error
 
 
 def parse_scene(
@@ -44,10 +45,10 @@ def parse_scene(
     default_position: np.ndarray | None = None,
     default_rotation: int | None = None,
 ) -> Scene:
-    """A room from AI2-THOR's object records and reachable points [P, 3]; points are sorted.
+    """A room from AI2-THOR's object records and reachable points [P, 3], which get sorted.
 
     Raises:
-      SceneError: a record or the points break a rule; names scene, object and rule.
+      SceneError: a record or the points break a rule; it names scene, object and rule.
     """
     objects = [parse_object(name, r) for r in records if _text(name, r, "objectType") != IGNORED]
     objects.sort(key=lambda item: (item.object_class, item.object_id))
@@ -61,10 +62,10 @@ def parse_scene(
 
 
 def check_points(name: str, points: np.ndarray) -> np.ndarray:
-    """Reachable points [P, 3] sorted by (x, z), without repeats.
+    """Reachable points [P, 3], sorted by (x, z) and without duplicates.
 
     Raises:
-      SceneError: there are none, or they do not lie on a grid of 0.25 m.
+      SceneError: there are none, or they are not on a grid of 0.25 m.
     """
     if len(points) == 0:
         raise SceneError(f"{name}: no reachable position")
@@ -82,7 +83,7 @@ def check_points(name: str, points: np.ndarray) -> np.ndarray:
 
 
 def parse_object(scene: str, record: Mapping[str, Any]) -> SceneObject:
-    """One object from its metadata record.
+    """An object from its metadata record.
 
     Raises:
       SceneError: a field is missing, of the wrong kind, or not finite.
@@ -140,7 +141,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _corners(scene: str, name: str, oriented: Any) -> np.ndarray:
-    """Corners [8, 3] of an oriented box; three edges from the first must be its sides."""
+    """Corners [8, 3] of an oriented box, in AI2-THOR's order."""
     points = oriented.get("cornerPoints") if isinstance(oriented, Mapping) else None
     if (
         not isinstance(points, Sequence)
@@ -156,7 +157,7 @@ def read_scenes(path: Path) -> list[Scene]:
     """The rooms of a scene file.
 
     Raises:
-      SceneError: it is not such a file, or a scene breaks a rule; one line naming where.
+      SceneError: it is not such a file, or a scene breaks a rule.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -202,7 +203,7 @@ def _read_scene(path: Path, document: Any) -> Scene:
 
 
 def _agent(scene: str, agent: Any) -> tuple[np.ndarray | None, int | None]:
-    """Position and rotation of a level agent that looks along an axis or diagonal, else None."""
+    """Position and rotation of an agent that looks level along an axis or diagonal, or None."""
     if not isinstance(agent, Mapping):
         raise SceneError(f"{scene}: agent is not metadata's agent record")
     position = _vector(scene, "agent", agent, "position")

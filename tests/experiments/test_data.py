@@ -18,7 +18,7 @@ from experiments import evaluate, scenes, train_zero_shot
 from tdanet_jax.agent.agent import Detection
 from tdanet_jax.io import files
 from tdanet_jax.scenes import SceneTables, dataset
-from tdanet_jax.scenes.offline import importer
+from tdanet_jax.scenes.offline import features, importer
 from tests.conftest import SOME_ROOMS
 from tests.support import original
 from tests.support.command import TINY
@@ -27,7 +27,7 @@ from tests.support.command import TINY
 @pytest.fixture(autouse=True)
 def parts_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Imports keep their parts in a cache of their own; the bundled tables stay where they are."""
-    monkeypatch.setattr(importer, "_parts_folder", lambda root: tmp_path / "parts")
+    monkeypatch.setattr(importer, "_cache_folder", lambda root: tmp_path / "parts")
 
 
 def fails(command, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -70,7 +70,7 @@ def test_the_miniature_trains_and_evaluates(
     assert json.loads(Path("shortest/results.json").read_text())["seen"]["L>=1"]["SR"] == 100
     train_zero_shot.main([*rooms, *run])
     results = json.loads(Path("run/results.json").read_text())
-    assert results["data_version"] == dataset.load(Path("rooms.npz")).tables.data_version
+    assert results["data_version"] == dataset.load_rooms(Path("rooms.npz")).tables.data_version
     assert results["seen"]["L>=1"]["n"] == 2, "the published episodes"
     assert results["unseen"] is None
     assert str(tmp_path / "rooms.npz") in Path("run/results.md").read_text()
@@ -110,7 +110,7 @@ def test_an_import_that_was_stopped_goes_on_where_it_was(
     assert "FloorPlan21_physics/resnet18_featuremap.hdf5: no such file" in message
     assert read == []
     write_features(source / "FloorPlan21_physics")
-    for where, what in ((importer, "write_features"), (dataset, "save")):
+    for where, what in ((features, "write_features"), (dataset, "save_rooms")):
 
         def stop(*_: Any) -> None:
             os.kill(os.getpid(), signal.SIGINT)
@@ -132,8 +132,8 @@ def test_an_import_that_was_stopped_goes_on_where_it_was(
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "original", "rooms.features.npy", "rooms.npz"
     ]  # fmt: skip
-    rooms = dataset.load(tmp_path / "rooms.npz")
-    assert (importer.load_features(tmp_path / "rooms.npz", rooms.tables) == 1).all()
+    rooms = dataset.load_rooms(tmp_path / "rooms.npz")
+    assert (features.load_features(tmp_path / "rooms.npz", rooms.tables) == 1).all()
 
 
 def test_an_import_of_feature_maps_asks_for_h5py_first(

@@ -175,7 +175,7 @@ def test_a_model_that_was_trained_on_feature_maps_sees_those_of_the_rooms(
     rooms = importer.read_folder(original.write_all(tmp_path / "original"), lambda *_: None)
     maps = np.random.default_rng(0).normal(size=(rooms.tables.num_states, 512, 7, 7))
     for name, share in (("own", 1.0), ("other", 3.0)):
-        dataset.save(rooms, tmp_path / f"{name}.npz")
+        dataset.save_rooms(rooms, tmp_path / f"{name}.npz")
         np.save(tmp_path / f"{name}.features.npy", (share * maps).astype(np.float16))
     network = dataclasses.replace(TINY.network, image="features")
     config = dataclasses.replace(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tdanet_jax.io import files
-from tdanet_jax.scenes import cache, ithor, tables
+from tdanet_jax.scenes import cache, ithor, tabulation
 from tests.support import toy
 
 # Builds (slowly enough to overlap) and prints the tables' version.
@@ -43,7 +43,7 @@ def forbid_building(monkeypatch: pytest.MonkeyPatch) -> None:
     def build(*_: object, **__: object) -> None:
         raise AssertionError("built although cached")
 
-    monkeypatch.setattr(tables, "build", build)
+    monkeypatch.setattr(tabulation, "build", build)
 
 
 def test_built_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,7 +128,7 @@ def test_what_nobody_has_used_for_long_is_removed(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """When tables are stored: other tables and parts of imports, and nothing else."""
-    before = time.time() - 86400 * (cache.FORGOTTEN_DAYS + 1)
+    before = time.time() - 86400 * (cache.UNUSED_DAYS + 1)
     folder.mkdir()
     for name in ("old", "used", "new"):
         for path in (folder / f"ithor-{name}.npz", folder / f"ithor-{name}.sha256",

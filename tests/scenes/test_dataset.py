@@ -12,7 +12,7 @@ import pytest
 
 from tdanet_jax.io import archive
 from tdanet_jax.io.untrusted import FileError
-from tdanet_jax.scenes import SceneTables, dataset, tables
+from tdanet_jax.scenes import SceneTables, dataset, tabulation
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode, Rooms
 from tdanet_jax.splits import make_split
 from tests.support import toy
@@ -20,8 +20,7 @@ from tests.support import toy
 
 @pytest.fixture(scope="module")
 def rooms() -> SceneTables:
-    draw = np.random.default_rng(1)
-    return tables.build([toy.random_room(draw, name=f"Room{i}") for i in range(3)])
+    return tabulation.build(toy.random_rooms(1))
 
 
 def test_rooms_come_back_with_their_extras(rooms: SceneTables, tmp_path: Path) -> None:
@@ -29,8 +28,8 @@ def test_rooms_come_back_with_their_extras(rooms: SceneTables, tmp_path: Path) -
     extras = Extras({"kitchen": {"Mug": {"Sofa": 0.5}}}, (episode,), ("A", "B"),
                     np.eye(2, dtype=np.float32), {"Room2": "test"})  # fmt: skip
     path = tmp_path / "rooms.npz"
-    dataset.save(Rooms(rooms, extras), path)
-    back = dataset.load(path)
+    dataset.save_rooms(Rooms(rooms, extras), path)
+    back = dataset.load_rooms(path)
     assert back.extras is not None
     assert (back.extras.parents, list(back.extras.episodes)) == (extras.parents, [episode])
     assert back.extras.graph_classes == ("A", "B")
@@ -45,7 +44,7 @@ def test_rooms_come_back_with_their_extras(rooms: SceneTables, tmp_path: Path) -
 
 def test_tables_alone_are_a_file_of_rooms(rooms: SceneTables, tmp_path: Path) -> None:
     rooms.save(tmp_path / "rooms.npz")
-    extras = dataset.load(tmp_path / "rooms.npz").extras
+    extras = dataset.load_rooms(tmp_path / "rooms.npz").extras
     assert extras is not None
     assert extras.class_graph(rooms.classes) is None
     assert not extras.parents
@@ -83,7 +82,7 @@ def test_numbers_that_contradict_each_other(rooms: SceneTables, tmp_path: Path, 
     broken = dataclasses.replace(rooms, **{name: change(getattr(rooms, name))})
     broken.save(tmp_path / "rooms.npz")
     with pytest.raises(FileError, match=r"rooms\.npz: not a file of rooms \(") as error:
-        dataset.load(tmp_path / "rooms.npz")
+        dataset.load_rooms(tmp_path / "rooms.npz")
     assert str(error.value).isprintable()
 
 
@@ -97,7 +96,7 @@ def test_files_that_were_written_before_rooms_could_say_what_they_are_for(
 ) -> None:
     path, empty = tmp_path / "rooms.npz", np.zeros((0, 0), np.float32)
     archive.write(path, {**rooms.to_arrays(), "extras/notes": notes(), "extras/adjacency": empty})
-    extras = dataset.load(path).extras
+    extras = dataset.load_rooms(path).extras
     assert extras is not None
     assert extras.parts == {}
 
@@ -112,17 +111,17 @@ def test_rooms_that_say_what_they_are_for() -> None:
     ]
     parts = {"FloorPlan2": "test", "Den": "train", "Hall": "test"}
     parts |= {f"Own{i}": "train" for i in range(5)}
-    rooms = Rooms(tables.build(scenes), Extras(parts=parts))
+    rooms = Rooms(tabulation.build(scenes), Extras(parts=parts))
     found = {}
     for validation in (False, True):
-        split = dataset.with_own_rooms(make_split("18/4", validation), rooms, validation)
+        split = dataset.assign_rooms(make_split("18/4", validation), rooms, validation)
         split = split.within(kinds, ("Apple",))
         found[validation] = set(split.train_scenes), set(split.eval_scenes)
     own = {f"Own{i}" for i in range(5)}
     assert found[False] == ({"FloorPlan1", "Den"} | own, {"FloorPlan2", "FloorPlan30", "Hall"})
     assert found[True] == ({"FloorPlan1"} | own - {"Own4"}, {"Den", "Own4"})
     split = make_split("18/4")
-    assert dataset.with_own_rooms(split, Rooms(rooms.tables, None)) == split
+    assert dataset.assign_rooms(split, Rooms(rooms.tables, None)) == split
 
 
 def test_other_archives(rooms: SceneTables, tmp_path: Path) -> None:
@@ -140,17 +139,10 @@ def test_other_archives(rooms: SceneTables, tmp_path: Path) -> None:
         change = {"extras/adjacency": np.zeros((0, 0), np.float32), **change}
         archive.write(path, {**arrays, **change})
         with pytest.raises(FileError, match=r"rooms\.npz: not a file of rooms"):
-            dataset.load(path)
+            dataset.load_rooms(path)
     np.savez(path, a=np.zeros(3))
     with pytest.raises(FileError, match=r"rooms\.npz: not a file of rooms"):
         dataset.load_rooms(str(path))
     path.write_text("{}")
     with pytest.raises(FileError, match=r"rooms\.npz: not an npz archive"):
-        dataset.load(path)
-
-
-def test_a_room_as_a_scene(rooms: SceneTables) -> None:
-    scene = dataset.as_scene(rooms.subset(["Room1"]))
-    assert scene.name == "Room1"
-    assert {item.object_class for item in scene.objects} <= set(rooms.classes)
-    assert scene.objects[0].box.shape == (2, 3)
+        dataset.load_rooms(path)

@@ -7,15 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tdanet_jax.scenes import SceneError, floor_plan, tables
+from tdanet_jax.scenes import SceneError, floor_plan, tabulation
 from tests.support import toy
 
 
 def test_outlines_of_the_boxes_of_a_room_of_ones_own():
     mug = toy.thing("Mug", (1.0, 1.0, 2.0), (0.2, 0.1, 0.4))
     sofa = toy.thing("Sofa", (-1.0, 0.5, 0.0), (1.0, 1.0, 2.0))
-    built = tables.build([toy.room(toy.line(3), mug, sofa)])
-    plan = floor_plan.load(built, "Toy")
+    built = tabulation.build([toy.room(toy.line(3), mug, sofa)])
+    plan = floor_plan.of_room(built, "Toy")
     assert plan.classes == ("Sofa", "Mug")  # largest first
     np.testing.assert_allclose(plan.outlines[1].min(axis=0), (0.9, 1.8))
     np.testing.assert_allclose(plan.outlines[1].max(axis=0), (1.1, 2.2))
@@ -25,15 +25,15 @@ def test_outlines_of_the_boxes_of_a_room_of_ones_own():
 
 
 def test_objects_without_a_box_are_left_out():
-    built = tables.build([toy.corridor()])
+    built = tabulation.build([toy.corridor()])
     boxes = np.full_like(built.object_box, np.nan)
-    plan = floor_plan.load(dataclasses.replace(built, object_box=boxes), "Corridor")
+    plan = floor_plan.of_room(dataclasses.replace(built, object_box=boxes), "Corridor")
     assert plan.classes == ()
     np.testing.assert_allclose(plan.extent, (-0.125, -0.125, 0.125, 1.125))
 
 
 def test_bundled_rooms_have_oriented_outlines_where_their_boxes_are(ithor):
-    plan = floor_plan.load(ithor, "FloorPlan228")
+    plan = floor_plan.of_room(ithor, "FloorPlan228")
     own = ithor.object_scene == ithor.scenes.index("FloorPlan228")
     assert sorted(plan.classes) == sorted(ithor.classes[c] for c in ithor.object_class[own])
     slanted = 0
@@ -49,4 +49,4 @@ def test_bundled_rooms_have_oriented_outlines_where_their_boxes_are(ithor):
 
 def test_no_such_room(ithor):
     with pytest.raises(SceneError, match="Attic: no such room"):
-        floor_plan.load(ithor, "Attic")
+        floor_plan.of_room(ithor, "Attic")

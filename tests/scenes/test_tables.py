@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tdanet_jax.scenes import SceneError, SceneTables, tables
-from tdanet_jax.scenes.scene import Scene
+from tdanet_jax.scenes import SceneError, SceneTables, tabulation
 from tdanet_jax.scenes.visibility import geometry
 from tdanet_jax.vocabulary import ALL_TARGETS
 from tests.support import toy
@@ -20,14 +19,9 @@ from tests.support import toy
 DATA_VERSION = "d4909be88f83"
 
 
-def random_rooms(seed: int) -> list[Scene]:
-    draw = np.random.default_rng(seed)
-    return [toy.random_room(draw, name=f"Room{i}") for i in range(3)]
-
-
 @pytest.fixture(scope="module")
 def rooms() -> SceneTables:
-    return tables.build(random_rooms(0))
+    return tabulation.build(toy.random_rooms(0))
 
 
 def test_the_bundled_rooms_are_the_same_everywhere(ithor: SceneTables) -> None:
@@ -39,7 +33,7 @@ def test_the_bundled_rooms_are_the_same_everywhere(ithor: SceneTables) -> None:
 
 
 def test_states_of_poses() -> None:
-    t = tables.build([toy.corridor(), dataclasses.replace(toy.corridor(), name="Second")])
+    t = tabulation.build([toy.corridor(), dataclasses.replace(toy.corridor(), name="Second")])
     assert t.nearest_state(0, 0.1, 0.55, 90, 30) == (2 * 8 + 2) * 2 + 1
     assert t.nearest_state(0, 9.0, 9.0, -45) == (4 * 8 + 7) * 2
     assert t.nearest_state(1, 9.0, 0.0, 360) == 5 * 16
@@ -50,27 +44,9 @@ def test_states_of_poses() -> None:
 
 def test_the_nearest_point_is_that_as_the_crow_flies() -> None:
     """And not by the longer of its two sides: 0.28 m along z, or 0.25 m across and 0.22 m along."""
-    t = tables.build([toy.room(toy.points((0.0, 0.0), (0.25, 0.5)), toy.corridor().objects[0])])
+    t = tabulation.build([toy.room(toy.points((0.0, 0.0), (0.25, 0.5)), toy.corridor().objects[0])])
     assert t.nearest_state(0, 0.0, 0.28, 0) == 0
     assert t.nearest_state(0, 0.1, 0.3, 0) == 16
-
-
-def test_however_many_rooms_are_computed_at_once_the_tables_are_the_same(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    versions = set()
-    for workers in (1, 3):
-        monkeypatch.setattr(tables, "MOST_WORKERS", workers)
-        monkeypatch.setattr(tables.os, "cpu_count", lambda: 4)
-        versions.add(tables.build(random_rooms(2)).data_version)
-    assert len(versions) == 1
-
-
-def test_no_more_classes_than_can_be_numbered() -> None:
-    names = [f"Thing{i}" for i in range(128)]
-    things = [toy.thing(name, (0.0, toy.CAMERA, 2.0)) for name in names]
-    with pytest.raises(SceneError, match="128 classes, more than 127"):
-        tables.build([toy.room(toy.line(1), *things)])
 
 
 @pytest.mark.parametrize("which", ["rooms", "some_rooms"])
@@ -133,9 +109,9 @@ def test_visible_bits_by_hand(rooms: SceneTables) -> None:
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=5)
 def test_a_subset_is_what_its_rooms_alone_would_give(seed: int) -> None:
-    scenes = random_rooms(seed)
-    whole = tables.build(scenes)
-    alone = tables.build([scenes[0], scenes[2]], classes=whole.classes)
+    scenes = toy.random_rooms(seed)
+    whole = tabulation.build(scenes)
+    alone = tabulation.build([scenes[0], scenes[2]], classes=whole.classes)
     assert whole.subset(["Room2", "Room0"]).data_version == alone.data_version
 
 
@@ -172,23 +148,8 @@ def test_the_version_follows_every_field(rooms: SceneTables, field: str) -> None
     assert other.data_version != rooms.data_version
 
 
-def test_class_outside_the_vocabulary() -> None:
-    with pytest.raises(SceneError, match=r"Corridor: Apple\|0: class Apple"):
-        tables.build([toy.corridor()], classes=("Mug",))
-
-
-def test_corridor_by_hand() -> None:
-    t = tables.build([toy.corridor()], rules=dataclasses.replace(tables.RULES, void=100.0))
-    apple = t.targets.index("Apple")
-    ahead = t.distance[::16, apple]  # heading 0, horizon 0, from every point
-    assert ahead.tolist() == [3, 2, 1, 0, 0]
-    assert t.distance[4 * 2, apple] == 4 + 3  # from the first point, looking back
-    assert t.raster[0, 3, 3] == t.classes.index("Apple")
-    assert (t.raster[4 * 2] == -1).all()
-
-
-def test_a_room_in_which_nothing_is_seen() -> None:
-    t = tables.build([toy.room(toy.line(1), toy.thing("Apple", (0.0, 3.9, 0.0)))])
-    assert len(t.row_object) == 0
-    assert (t.distance == -1).all()
-    assert not t.visible_bits().any()
+def test_a_room_as_a_scene(rooms: SceneTables) -> None:
+    scene = rooms.subset(["Room1"]).as_scene()
+    assert scene.name == "Room1"
+    assert {item.object_class for item in scene.objects} <= set(rooms.classes)
+    assert scene.objects[0].box.shape == (2, 3)

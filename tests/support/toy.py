@@ -71,3 +71,9 @@ def random_room(draw: np.random.Generator, name: str = "Random") -> Scene:
             )
         )
     return room(points(*(kept * GRID_SIZE)), *objects, name=name, room_type=int(draw.integers(4)))
+
+
+def random_rooms(seed: int, count: int = 3) -> list[Scene]:
+    """Random rooms called Room0, Room1, ..."""
+    draw = np.random.default_rng(seed)
+    return [random_room(draw, name=f"Room{i}") for i in range(count)]

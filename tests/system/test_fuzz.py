@@ -84,7 +84,7 @@ def seeds(root: Path) -> list[tuple[Path, Callable[[Path], object]]]:
         tensors = [original.Tensor(np.arange(9), 1, (2, 3), (1, 2)), np.eye(3)]
         (root / "tensors.pkl").write_bytes(pickle.dumps(tensors, 3))
     (root / "glove.txt").write_text("mug 1 2 3\nbread 0.5 -1e-3 2\n")
-    dataset.save(importer.read_folder(scenes, lambda share, line: None), root / "rooms.npz")
+    dataset.save_rooms(importer.read_folder(scenes, lambda share, line: None), root / "rooms.npz")
     room = scenes / "FloorPlan1"
     names = ("grid.json", "graph.json", "visible_object_map.json", "objects_bb.json")
     return [
@@ -93,13 +93,13 @@ def seeds(root: Path) -> list[tuple[Path, Callable[[Path], object]]]:
         (root / "test_val_split" / "kitchen_test.pkl", read_pickle),
         (root / "data" / "gcn" / "adjmat.dat", read_matrix),
         (root / "tensors.pkl", read_tensor),
-        (root / "rooms.npz", dataset.load),
+        (root / "rooms.npz", dataset.load_rooms),
         (root / "glove.txt", words.load_word_vectors),
-        *features(root),
+        *feature_files(root),
     ]
 
 
-def features(root: Path) -> list[tuple[Path, Callable[[Path], object]]]:
+def feature_files(root: Path) -> list[tuple[Path, Callable[[Path], object]]]:
     with contextlib.suppress(ImportError):
         import h5py
 

@@ -17,10 +17,10 @@ from tests.system.test_kills import assert_equal_runs, final_state
 #: Names of classes and rooms go through sets and dictionaries: their order must not matter.
 BUILDER = """
 import numpy as np
-from tdanet_jax.scenes import tables
+from tdanet_jax.scenes import tabulation
 from tests import toy
 draw = np.random.default_rng(0)
-print(tables.build([toy.random_room(draw, name=f"Room{i}") for i in range(4)]).data_version)
+print(tabulation.build([toy.random_room(draw, name=f"Room{i}") for i in range(4)]).data_version)
 """
 
 

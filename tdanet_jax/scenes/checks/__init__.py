@@ -1,1 +1,1 @@
-"""How well the rooms agree with AI2-THOR."""
+"""Checks of rooms: agreement with AI2-THOR, consistency, and a survey before training."""

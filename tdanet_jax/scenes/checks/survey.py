@@ -1,45 +1,47 @@
-"""What a user should know of a set of rooms before training: targets and parts out of reach."""
+"""What a user should know about a set of rooms before training in them."""
 
 from __future__ import annotations
 
+import warnings
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from tdanet_jax import words
+from tdanet_jax.scenes.dataset import Rooms, assign_rooms
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.visibility.rules import RULES
+from tdanet_jax.splits import make_split
+from tdanet_jax.vocabulary import ROOM_TYPES, TARGETS
 
 
 @dataclass(frozen=True)
-class Unfindable:
-    """A target class that is in a room but visible from none of its states."""
+class InvisibleTarget:
+    """A target class that is in a room, but visible from none of its states."""
 
     scene: str
     target: str
     reason: str
 
 
-def unfindable(tables: SceneTables) -> list[Unfindable]:
-    """Targets that no state of a room that holds them sees, with the reason."""
+def invisible_targets(tables: SceneTables) -> list[InvisibleTarget]:
+    """The targets that are visible from no state of a room that holds them, with the reason."""
     found = []
-    best = _least_distance(tables)
+    first = np.searchsorted(tables.state_scene, np.arange(len(tables.scenes)))
+    greatest = np.maximum.reduceat(tables.distance, first, axis=0)  # [R, G], -1 if never visible
     for scene, name in enumerate(tables.scenes):
         here = np.flatnonzero(tables.object_scene == scene)
         for goal, target in enumerate(tables.targets):
-            if target not in tables.classes or best[scene, goal] >= 0:
+            if target not in tables.classes or greatest[scene, goal] >= 0:
                 continue
             items = here[tables.object_class[here] == tables.classes.index(target)]
             if len(items):
-                found.append(Unfindable(name, target, _reason(tables, scene, items)))
+                found.append(InvisibleTarget(name, target, _reason(tables, scene, items)))
     return found
-
-
-def _least_distance(tables: SceneTables) -> np.ndarray:
-    """Largest distance entry per scene and target, -1 where no state has a way: [R, G]."""
-    first = np.searchsorted(tables.state_scene, np.arange(len(tables.scenes)))
-    return np.maximum.reduceat(tables.distance, first, axis=0)
 
 
 def _reason(tables: SceneTables, scene: int, items: np.ndarray) -> str:
@@ -54,17 +56,79 @@ def _reason(tables: SceneTables, scene: int, items: np.ndarray) -> str:
     return "hidden wherever it is within reach"
 
 
-def parts(tables: SceneTables) -> dict[str, int]:
-    """Scenes whose reachable points are not all connected, and in how many parts they are."""
-    count, heads = tables.next_position.shape
-    tail = np.repeat(np.arange(count), heads)
+def disconnected_rooms(tables: SceneTables) -> dict[str, int]:
+    """Rooms whose reachable points are not all connected -> number of connected components."""
+    count, headings = tables.next_position.shape
+    tail = np.repeat(np.arange(count), headings)
     links = coo_array(
-        (np.ones(count * heads, bool), (tail, tables.next_position.reshape(-1))), (count, count)
+        (np.ones(len(tail), bool), (tail, tables.next_position.reshape(-1))), (count, count)
     )
     _, label = connected_components(links, directed=False)
-    result = {}
-    for scene, name in enumerate(tables.scenes):
-        pieces = len(np.unique(label[tables.position_scene == scene]))
-        if pieces > 1:
-            result[name] = pieces
-    return result
+    components = {
+        name: len(np.unique(label[tables.position_scene == scene]))
+        for scene, name in enumerate(tables.scenes)
+    }
+    return {name: number for name, number in components.items() if number > 1}
+
+
+def summary(tables: SceneTables) -> Iterator[str]:
+    """Lines on the size of the tables, and on what in them cannot be reached."""
+    yield (
+        f"{len(tables.scenes)} rooms, {len(tables.position):,} positions, "
+        f"{tables.num_states:,} states, {len(tables.row_object):,} detections, "
+        f"{len(tables.classes)} classes; tables {tables.data_version}"
+    )
+    if split := disconnected_rooms(tables):
+        listed = ", ".join(f"{name} ({count} parts)" for name, count in split.items())
+        yield f"Reachable points not all connected: {listed}"
+    lost = invisible_targets(tables)
+    yield f"Targets visible from nowhere in a room that holds them: {len(lost)}"
+    rooms = defaultdict(list)
+    for case in lost:
+        rooms[case.target, case.reason].append(case.scene)
+    for (target, reason), names in sorted(rooms.items()):
+        yield f"  {target}: {reason}: {', '.join(names)}"
+
+
+def uses(rooms: Rooms) -> Iterator[str]:
+    """Lines on what rooms can be used for and what they need.
+
+    Warns of rooms that no split uses, and if there is nothing to train or to be evaluated in.
+    """
+    tables = rooms.tables
+    split = assign_rooms(make_split("22/0"), rooms)
+    train = [name for name in tables.scenes if name in split.train_scenes]
+    test = [name for name in tables.scenes if name in split.eval_scenes]
+    yield f"Rooms to train in: {len(train)}; to be evaluated in: {len(test)}"
+    unused = [name for name in tables.scenes if name not in {*train, *test}]
+    if unused or not train or not test:
+        named = f"no split uses {', '.join(unused)}; " if unused else ""
+        warnings.warn(
+            f"{named}a run needs a room to train in and one to be evaluated in: by the names of "
+            'iTHOR\'s rooms, or by "split": "train" or "test" in the scene file',
+            stacklevel=2,
+        )
+    purposes = {"train in": train, "be evaluated in": test}
+    empty = [use for use, names in purposes.items() if names and not _hold_target(tables, names)]
+    if empty:
+        types = [room for i, room in enumerate(ROOM_TYPES) if i in tables.room_type]
+        listed = "; ".join(f"in a {room}, {', '.join(TARGETS[room])}" for room in types)
+        warnings.warn(
+            f"no room to {' or to '.join(empty)} holds a target that can be found there, and a run "
+            f"needs one: {listed}",
+            stacklevel=2,
+        )
+    if not (tables.row_box >= 0).any():
+        yield "No boxes in any room: an agent that sees detections will see nothing."
+    if lacking := words.load_bundled().missing(tables.classes):
+        yield f"Needs --word-vectors: no bundled ones for {', '.join(lacking)}"
+
+
+def _hold_target(tables: SceneTables, rooms: Iterable[str]) -> bool:
+    """Whether an episode can start in any of these rooms."""
+    for room in map(tables.scenes.index, rooms):
+        targets = TARGETS[ROOM_TYPES[tables.room_type[room]]]
+        goals = [tables.targets.index(name) for name in targets if name in tables.targets]
+        if tables.reachable[tables.position_scene == room][:, goals].any():
+            return True
+    return False

@@ -1,1 +1,1 @@
-"""The original offline data (the layout of SAVN, MJOLNIR and SSNet), in and out."""
+"""Import and export of the original offline data, in the layout of SAVN, MJOLNIR and SSNet."""

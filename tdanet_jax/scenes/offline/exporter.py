@@ -1,4 +1,4 @@
-"""Tables as a folder in the original layout, for code that reads it."""
+"""Export of tables as a folder in the original layout."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import numpy as np
 
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import hdf5
-from tdanet_jax.scenes.offline.importer import Report
 from tdanet_jax.scenes.offline.layout import (
     BOX_FILE,
     FEATURE_FILE,
@@ -24,6 +23,7 @@ from tdanet_jax.scenes.offline.layout import (
     PARENT_FILE,
     ROOM_NAMES,
     VISIBILITY_FILES,
+    Report,
     state_keys,
 )
 from tdanet_jax.scenes.tables import SceneTables
@@ -41,24 +41,24 @@ def write_folder(
     vectors: np.ndarray | None = None,
     features: bool = False,
 ) -> None:
-    """Writes a folder with one folder a scene; it appears whole or not at all.
+    """Writes a folder with one folder per scene, atomically.
 
     Args:
       out: must not exist.
-      report: called with the share done and the name of each scene.
+      report: called for every scene.
       parents: room type -> target -> parent -> R_p, for `c2p_prob.json`.
       vectors: [C, D] one vector per class, for `thor_glove/glove_map<D>d.hdf5`.
       features: also write `resnet18_featuremap.hdf5`: channel c of a map is 1 in the cells of the
-        7 x 7 raster that show class c of `tables.classes`, 0 elsewhere.
+        7 x 7 raster with class c of `tables.classes`, and 0 elsewhere.
     """
     if vectors is not None or features:
         hdf5.need_h5py(out)
-    fresh = files.partial_path(out)
+    temporary = files.partial_path(out)
     try:
-        fresh.mkdir(parents=True)
+        temporary.mkdir(parents=True)
         for i, name in enumerate(tables.scenes):
             room = tables.subset([name])
-            folder = fresh / name
+            folder = temporary / name
             folder.mkdir()
             write_scene(room, folder)
             if features:
@@ -66,16 +66,16 @@ def write_folder(
             report((i + 1) / len(tables.scenes), name)
         if parents:
             titled = {ROOM_NAMES[ROOM_TYPES.index(r)]: targets for r, targets in parents.items()}
-            _write(fresh / PARENT_FILE, titled)
+            _write(temporary / PARENT_FILE, titled)
         if vectors is not None:
-            write_vectors(tables.classes, vectors, fresh / "thor_glove")
-        os.replace(fresh, out)
+            write_vectors(tables.classes, vectors, temporary / "thor_glove")
+        os.replace(temporary, out)
     finally:
-        shutil.rmtree(fresh, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def write_scene(room: SceneTables, folder: Path) -> None:
-    """Writes grid, graph, visibility map (under both of its names), boxes and objects of a room."""
+    """Writes grid, graph, visibility map (under both names), boxes and objects of a room."""
     keys = state_keys(room.position)
     _write(folder / GRID_FILE, [dict(zip("xyz", point, strict=True)) for point in
                                 room.position.tolist()])  # fmt: skip
@@ -87,7 +87,7 @@ def write_scene(room: SceneTables, folder: Path) -> None:
 
 
 def graph(room: SceneTables, keys: Sequence[str]) -> dict[str, Any]:
-    """networkx's node-link form of the moves: a link per state and action that changes it."""
+    """The moves in networkx's node-link form: a link per state and action that changes it."""
     successor = transitions(room.next_position)
     links = [
         {"source": keys[state], "target": keys[to]}
@@ -105,8 +105,10 @@ def graph(room: SceneTables, keys: Sequence[str]) -> dict[str, Any]:
 
 
 def visible_from(room: SceneTables, keys: Sequence[str]) -> dict[str, list[str]]:
-    """Object id -> states. Objects that are visible from nowhere are not listed: the reference
-    draws its targets among all that are."""
+    """Object id -> keys of the states in which it is visible.
+
+    Objects that are never visible are not listed: the reference draws targets from all that are.
+    """
     rows = np.flatnonzero(room.row_visible)
     rows = rows[np.argsort(room.row_object[rows], kind="stable")]
     result: dict[str, list[str]] = {}
@@ -117,19 +119,19 @@ def visible_from(room: SceneTables, keys: Sequence[str]) -> dict[str, list[str]]
 
 
 def boxes(room: SceneTables, keys: Sequence[str]) -> dict[str, dict[str, list[float]]]:
-    """State -> class -> x1, y1, x2, y2 of each instance, pixels."""
+    """State -> class -> x1, y1, x2, y2 in pixels of each instance, concatenated."""
     result: dict[str, dict[str, list[float]]] = {key: {} for key in keys}
     rows = np.flatnonzero(room.row_box[:, 0] >= 0)
     pixels = (room.row_box[rows] / room.subpixel).tolist()
-    states, kinds = room.row_state[rows].tolist(), room.row_class[rows].tolist()
-    for state, kind, box in zip(states, kinds, pixels, strict=True):
-        result[keys[state]].setdefault(room.classes[kind], []).extend(box)
+    states, classes = room.row_state[rows].tolist(), room.row_class[rows].tolist()
+    for state, c, box in zip(states, classes, pixels, strict=True):
+        result[keys[state]].setdefault(room.classes[c], []).extend(box)
     return result
 
 
 def objects(room: SceneTables, keys: Sequence[str]) -> dict[str, Any]:
-    """What the original layout leaves out: every object's class and box (metres), and whose each
-    box of `objects_bb.json` is, as places in the list of objects."""
+    """What the original layout lacks: the class and box (metres) of every object, and for each box
+    of `objects_bb.json` the index of its object in that list."""
     rows = np.flatnonzero(room.row_box[:, 0] >= 0)
     instances: dict[str, list[int]] = {key: [] for key in keys}
     for state, item in zip(room.row_state[rows].tolist(), room.row_object[rows].tolist(),
@@ -146,7 +148,7 @@ def objects(room: SceneTables, keys: Sequence[str]) -> dict[str, Any]:
 
 
 def write_features(room: SceneTables, path: Path) -> None:
-    """One-hot class rasters as feature maps [512, 7, 7], a dataset per state."""
+    """Writes one-hot class rasters as feature maps [512, 7, 7], a dataset per state."""
     import h5py
 
     with h5py.File(path, "w") as file:
@@ -157,7 +159,7 @@ def write_features(room: SceneTables, path: Path) -> None:
 
 
 def write_vectors(classes: Sequence[str], vectors: np.ndarray, folder: Path) -> None:
-    """A dataset per class name, as `thor_glove` holds them."""
+    """Writes a dataset per class name, as in `thor_glove`."""
     import h5py
 
     folder.mkdir()

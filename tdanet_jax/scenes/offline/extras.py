@@ -1,4 +1,4 @@
-"""What lies beside the scenes in the original data: parents, class graph, test episodes."""
+"""What the original data contain in addition to scenes: parents, class graph, test episodes."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ GRAPH_CLASSES, GRAPH_MATRIX = "objects.txt", "adjmat.dat"
 
 
 def read_extras(folders: Iterable[Path], grids: Mapping[str, Grid]) -> tuple[Extras, list[str]]:
-    """What the first folder that has it holds of each kind, and a line for each.
+    """Each of the extras from the first folder that has it, and a line on each.
 
     Args:
-      grids: the imported scenes; episodes in others are left out.
+      grids: the imported scenes; episodes in other scenes are left out.
 
     Raises:
-      FileError: a file is broken; names file and reason.
+      FileError: a file is broken.
     """
     places = list(folders)
     parents, adjacency = _first(places, PARENT_FILE), _first(places, GRAPH_FOLDER)
@@ -45,12 +45,12 @@ def read_extras(folders: Iterable[Path], grids: Mapping[str, Grid]) -> tuple[Ext
         lines.append(f"{adjacency}: a graph of {len(names)} classes")
     if published is not None:
         episodes: list[PublishedEpisode] = []
-        left = 0
+        skipped = 0
         for path in sorted(p for part in PARTS for p in published.glob(f"*_{part}.pkl")):
             kept, others = read_episodes(path, grids)
-            episodes, left = episodes + kept, left + others
+            episodes, skipped = episodes + kept, skipped + others
         extras = dataclasses.replace(extras, episodes=tuple(episodes))
-        rest = f"; {left} in scenes that were not imported" if left else ""
+        rest = f"; {skipped} in scenes that were not imported" if skipped else ""
         lines.append(f"{published}: {len(episodes)} episodes{rest}")
     return extras, lines
 
@@ -60,10 +60,10 @@ def _first(folders: list[Path], name: str) -> Path | None:
 
 
 def read_parents(path: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Room type -> target -> parent -> R_p, of `c2p_prob.json`.
+    """Room type -> target -> parent -> R_p, from `c2p_prob.json`.
 
     Raises:
-      FileError: it is not of this shape, or a reward is not between 0 and 100.
+      FileError: its structure is another, or a reward is not between 0 and 100.
     """
     result: dict[str, dict[str, dict[str, float]]] = {}
     for title, targets in jsons.members(path):
@@ -85,7 +85,7 @@ def read_parents(path: Path) -> dict[str, dict[str, dict[str, float]]]:
 
 
 def read_graph(names_path: Path, matrix_path: Path) -> tuple[tuple[str, ...], np.ndarray]:
-    """The class graph: n names and the adjacency [n, n] float32.
+    """The class graph: n names, and their adjacency [n, n] float32.
 
     Raises:
       FileError: a file is missing or broken, or they do not match.
@@ -96,7 +96,7 @@ def read_graph(names_path: Path, matrix_path: Path) -> tuple[tuple[str, ...], np
     text = names_path.read_text(encoding="utf-8", errors="replace")
     names = tuple(line.strip() for line in text.splitlines() if line.strip())
     if not 0 < len(names) <= MOST_CLASSES or len(set(names)) != len(names):
-        raise FileError(names_path, "not a list of different class names")
+        raise FileError(names_path, "not a list of distinct class names")
     value = pickles.load_torch(matrix_path.read_bytes(), matrix_path)
     matrix = pickles.array(value, matrix_path)
     if matrix.shape != (len(names), len(names)):
@@ -108,7 +108,7 @@ def read_graph(names_path: Path, matrix_path: Path) -> tuple[tuple[str, ...], np
 
 
 def read_episodes(path: Path, grids: Mapping[str, Grid]) -> tuple[list[PublishedEpisode], int]:
-    """The episodes of `<room>_<test|val>.pkl` in known scenes, and how many are in others.
+    """The episodes of `<room>_<test|val>.pkl` in known scenes, and the number of all others.
 
     Raises:
       FileError: it is not a list of episodes, or a start is not on its scene's grid.
@@ -123,7 +123,7 @@ def read_episodes(path: Path, grids: Mapping[str, Grid]) -> tuple[list[Published
     for episode in _episodes(path, records, part):
         if episode.scene in grids:
             grid = grids[episode.scene]
-            grid.find(path, episode.x, episode.z, episode.rotation, episode.horizon)
+            grid.state_at(path, episode.x, episode.z, episode.rotation, episode.horizon)
             found.append(episode)
         else:
             others += 1
@@ -141,12 +141,12 @@ def _episodes(path: Path, records: list[Any], part: str) -> Iterator[PublishedEp
         known = scene_of(scene) if isinstance(scene, str) else None
         if known is None or not isinstance(target, str):
             raise FileError(path, f"{where}: {scene!r:.40} is not an iTHOR scene, or no target")
-        if "glove_embedding" in record:  # decoded to be sure of it; the vectors come with a file
+        if "glove_embedding" in record:  # only checked: word vectors come from --word-vectors
             pickles.array(record["glove_embedding"], path)
         state = record["state"]
         fields = state.state if isinstance(state, pickles.Call) else None
         if not isinstance(fields, dict) or not state.name.endswith(pickles.AGENT_STATE):
-            raise FileError(path, f"{where}: its state is no {pickles.AGENT_STATE}")
+            raise FileError(path, f"{where}: its state is not a {pickles.AGENT_STATE}")
         x, z, rotation, horizon = (
             jsons.number(path, fields.get(name), f"{where}: {name}", 1000.0)
             for name in ("x", "z", "rotation", "horizon")

@@ -1,9 +1,9 @@
-"""Names of files and states in the original offline data. docs/data.md describes them all."""
+"""Folders, files and state keys of the original offline data; docs/data.md describes them all."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +16,18 @@ from tdanet_jax.splits import SCENE_NUMBERS
 from tdanet_jax.vocabulary import ROOM_TYPES
 
 GRID_FILE, GRAPH_FILE, BOX_FILE = "grid.json", "graph.json", "objects_bb.json"
-#: Both names of the visibility map, the one that says its distance first; then the raw metadata.
+#: In order of preference: both names of the visibility map, then the raw metadata.
 VISIBILITY_FILES = ("visible_object_map_1.5.json", "visible_object_map.json", "metadata.json")
-#: Not part of the original layout: what it leaves out of our tables (see docs/data.md).
+#: Our addition: what the original layout lacks of our tables.
 OBJECT_FILE = "objects.json"
 FEATURE_FILE = "resnet18_featuremap.hdf5"
 FEATURE_SHAPE = (512, 7, 7)
 PARENT_FILE = "c2p_prob.json"
-#: Names of the room types in `c2p_prob.json`, in the order of `ROOM_TYPES`.
+#: Names of `ROOM_TYPES` in `c2p_prob.json`, in the same order.
 ROOM_NAMES = ("Kitchen", "Living_Room", "Bedroom", "Bathroom")
+
+#: Called with the share that is done and a line of text.
+Report = Callable[[float, str], None]
 
 _SCENE = re.compile(r"FloorPlan(\d{1,4})(_physics)?")
 _NUMBER = r"(-?\d{1,4}(?:\.\d{1,9})?)"
@@ -32,7 +35,7 @@ _KEY = re.compile(rf"{_NUMBER}\|{_NUMBER}\|(\d{{1,3}})(?:\.0)?\|(\d{{1,2}})(?:\.
 
 
 def scene_of(name: str) -> tuple[str, int] | None:
-    """Name and room type of an iTHOR scene, written with or without "_physics", or None."""
+    """Name and room type of an iTHOR scene, with or without "_physics", or None."""
     match = _SCENE.fullmatch(name)
     if match is None:
         return None
@@ -43,16 +46,46 @@ def scene_of(name: str) -> tuple[str, int] | None:
     return None
 
 
+def find_root(folder: Path) -> Path:
+    """The folder whose children are the scenes: `folder`, or one up to two levels inside it.
+
+    Raises:
+      FileError: there is none.
+    """
+    for pattern in ("FloorPlan*", "*/FloorPlan*", "*/*/FloorPlan*"):
+        for place in sorted(folder.glob(pattern)):
+            if place.is_dir() and scene_of(place.name) is not None:
+                return place.parent
+    raise FileError(folder, "no folder, or no folders FloorPlan1 to FloorPlan430 in it")
+
+
+def find_scenes(root: Path) -> list[tuple[str, int, Path]]:
+    """Name, room type and folder of each scene, by room type and number.
+
+    Raises:
+      FileError: two folders belong to one scene.
+    """
+    found: dict[str, tuple[str, int, Path]] = {}
+    for place in sorted(root.glob("FloorPlan*")):
+        known = scene_of(place.name)
+        if known is None or not place.is_dir():
+            continue
+        if known[0] in found:
+            raise FileError(place, f"{known[0]} is there twice")
+        found[known[0]] = (*known, place)
+    return sorted(found.values(), key=lambda scene: (scene[1], int(scene[0][9:])))
+
+
 def state_key(x: float, z: float, rotation: int, horizon: int) -> str:
     """A state's key as the reference controller writes it: "-0.00|1.25|45|30".
 
-    Metres are rounded first and written then, so that -0.001 and -0.0 give "-0.00".
+    Metres are rounded before they are formatted, so that -0.001 and -0.0 give "-0.00".
     """
     return f"{round(x, 2):0.2f}|{round(z, 2):0.2f}|{rotation:d}|{horizon:d}"
 
 
 def state_keys(points: np.ndarray) -> list[str]:
-    """Keys of all states of points [P, 3], in the order of the tables: P * 16."""
+    """Keys of all P * 16 states at points [P, 3], in the order of the tables."""
     return [
         state_key(float(x), float(z), *poses.split(view).degrees)
         for x, _, z in points
@@ -71,25 +104,25 @@ class Grid:
         self._known: dict[str, int] = {}
 
     def state(self, path: Path | str, key: object) -> int:
-        """The state that a key names; "-0.00" and "0.00" are one place.
+        """The state with a key; "-0.00" and "0.00" are equal.
 
         Raises:
-          FileError: it is no key, or its point is not on the grid.
+          FileError: it is not a key, or its point is not on the grid.
         """
         if not isinstance(key, str):
-            raise FileError(path, "a state key that is no text")
+            raise FileError(path, "a state key that is not text")
         if key not in self._known:
-            self._known[key] = self._find(path, key)
+            self._known[key] = self._parse(path, key)
         return self._known[key]
 
-    def _find(self, path: Path | str, key: str) -> int:
+    def _parse(self, path: Path | str, key: str) -> int:
         match = _KEY.fullmatch(key)
         if match is None:
             raise FileError(path, f"state key {key!r} is not x|z|rotation|horizon")
-        return self.find(path, float(match[1]), float(match[2]), int(match[3]), int(match[4]))
+        return self.state_at(path, float(match[1]), float(match[2]), int(match[3]), int(match[4]))
 
-    def find(self, path: Path | str, x: float, z: float, rotation: int, horizon: int) -> int:
-        """The state at a place in metres, with a rotation and a horizon in degrees.
+    def state_at(self, path: Path | str, x: float, z: float, rotation: int, horizon: int) -> int:
+        """The state at a point in metres, with rotation and horizon in degrees.
 
         Raises:
           FileError: there is none.

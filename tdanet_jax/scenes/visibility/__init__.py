@@ -1,1 +1,1 @@
-"""From boxes to what is seen: solids, rays, rasters."""
+"""From the boxes of objects to detections: solids, rays, rasters."""

@@ -1,9 +1,9 @@
-"""What a camera sees from each reachable point, as boxes in the image.
+"""The detections of a room: what a camera sees from each reachable point, as boxes in the image.
 
-Object surfaces are divided into patches. A patch is seen if nothing hides its centre from the
-camera and the centre projects into the image. An object's box in the image is the extent of its
-seen patches, clipped to the image. Projections are element-wise float32 operations that
-IEEE 754 defines to the last bit, so that tables are equal on every machine.
+Object surfaces are divided into patches. A patch is seen if its centre projects into the image and
+nothing lies between it and the camera. An object's box in the image is the extent of its seen
+patches, clipped to the image. Projections are element-wise float32 operations, which IEEE 754
+defines to the last bit, so that tables are equal on every machine.
 """
 
 from __future__ import annotations
@@ -14,22 +14,19 @@ import numpy as np
 
 from tdanet_jax import poses
 from tdanet_jax.poses import HORIZONS
-from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene, SceneObject
+from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene, SceneObject
 from tdanet_jax.scenes.visibility import rays
 from tdanet_jax.scenes.visibility.geometry import box_frame
 from tdanet_jax.scenes.visibility.rules import Rules
 from tdanet_jax.scenes.visibility.solids import THIN, Patches, millimetres, patches_of, solids_of
 from tdanet_jax.vocabulary import IMAGE_SIZE
 
-SUBPIXEL = 16  # boxes are stored in sixteenths of a pixel
-
-
-# Cosine and sine of each horizon; square roots are exact to the last bit everywhere.
+# Cosine and sine of each horizon; IEEE 754 defines square roots to the last bit.
 TILTS = ((np.float32(1), np.float32(0)), (np.sqrt(np.float32(0.75)), np.float32(0.5)))
 
 
 def turned(x: np.ndarray, z: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Coordinates to the right of and ahead of a level camera, for each of the eight headings."""
+    """Coordinates to the right of and ahead of a level camera, for each of the eight rotations."""
     half = np.sqrt(np.float32(0.5))
     plus, minus = (x + z) * half, (x - z) * half
     return [
@@ -45,41 +42,36 @@ def turned(x: np.ndarray, z: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def tilted(up: np.ndarray, ahead: np.ndarray, horizon: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates up from and ahead of the camera after looking down to `horizon`."""
+    """Coordinates above and ahead of the camera once it looks down to `horizon`."""
+    if horizon == 0:
+        return up, ahead
     cosine, sine = TILTS[horizon]
-    return (
-        (up, ahead)
-        if horizon == 0
-        else (
-            cosine * up + sine * ahead,
-            cosine * ahead - sine * up,
-        )
-    )
+    return cosine * up + sine * ahead, cosine * ahead - sine * up
 
 
 def project(across: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Distance from the image's middle, in sixteenths of a pixel, unclipped.
+    """Distance from the middle of the image, in sixteenths of a pixel, unclipped.
 
-    Points behind the camera land far outside the image, on their side of it.
+    Points behind the camera land far outside the image, on the side where they lie.
     """
     return across * (np.float32(IMAGE_SIZE * SUBPIXEL / 2) / np.maximum(depth, np.float32(1)))
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """What is seen from the cameras of one room: one row per state and object, sorted so."""
+class Detections:
+    """The detections of one room: one row per state and object in view, sorted by both."""
 
     state: np.ndarray  # [N] int32
     owner: np.ndarray  # [N] int32, index into the room's objects
     box: np.ndarray  # [N, 4] int16, x1, y1, x2, y2 in sixteenths of a pixel
-    visible: np.ndarray  # [N] bool, within reach and more than a sliver
+    visible: np.ndarray  # [N] bool, within reach and more than a sliver in view
 
 
-def nearness(scene: Scene, points: np.ndarray, patches: Patches, rules: Rules) -> np.ndarray:
-    """Whether each object is within `rules.reach` of each of `points`, horizontally: [P, O].
+def within_reach(scene: Scene, points: np.ndarray, patches: Patches, rules: Rules) -> np.ndarray:
+    """Whether each object is within `rules.reach` of each of `points`, horizontally: [P, O] bool.
 
-    Measured to the tightest known box where that is upright, else to the axis-aligned one; to
-    the patches that are left of a carved object.
+    The distance is to the oriented box if that is known and upright, otherwise to the axis-aligned
+    one; for a carved object, to its remaining patches.
     """
     result = np.empty((len(points), len(scene.objects)), bool)
     for k, item in enumerate(scene.objects):
@@ -93,7 +85,7 @@ def nearness(scene: Scene, points: np.ndarray, patches: Patches, rules: Rules) -
 
 
 def _gap_to_box(item: SceneObject, points: np.ndarray) -> np.ndarray:
-    """Squared horizontal distance of `points` [P, 3] from an object's box: [P], 0 inside."""
+    """Squared horizontal distance of `points` [P, 3] from an object's box: [P], 0 inside it."""
     origin, edges = box_frame(item.box, item.corners)
     flat = edges[np.abs(edges[:, 1]) < THIN][:, [0, 2]]
     if len(flat) != 2 or np.abs(flat).max(axis=1).min() < THIN:
@@ -107,20 +99,20 @@ def _gap_to_box(item: SceneObject, points: np.ndarray) -> np.ndarray:
     return gap
 
 
-def look_around(scene: Scene, rules: Rules, points: np.ndarray | None = None) -> Sight:
-    """Everything seen from `points` [P, 3] (default: all reachable ones) in all 16 views."""
+def detect(scene: Scene, rules: Rules, points: np.ndarray | None = None) -> Detections:
+    """The detections at `points` [P, 3] (by default the reachable ones) in all 16 views."""
     points = scene.points if points is None else points
     patches = patches_of(scene, rules)
     cameras = millimetres(points + np.array([0, CAMERA_ABOVE_AGENT, 0]))
-    before = np.zeros((len(points), len(patches.owner)))
+    facing = np.zeros((len(points), len(patches.owner)))
     for axis in range(3):
-        before += patches.normal[:, axis] * (cameras[:, axis, None] - patches.center[:, axis])
-    position, patch = np.nonzero(before > 0)
+        facing += patches.normal[:, axis] * (cameras[:, axis, None] - patches.center[:, axis])
+    position, patch = np.nonzero(facing > 0)
     group = position * len(scene.objects) + patches.owner[patch]
     whole = np.bincount(group, patches.area[patch], len(points) * len(scene.objects))
     target = np.rint(patches.center).astype(np.int32)
     seen = ~rays.cast(cameras[position], target[patch], solids_of(scene, rules))
-    near = nearness(scene, points, patches, rules).reshape(-1)
+    near = within_reach(scene, points, patches, rules).reshape(-1)
     least = np.where(near, whole * rules.sliver, np.inf)
     return _boxes_in_view(cameras, patches, position[seen], patch[seen], group[seen], least)
 
@@ -132,19 +124,20 @@ def _boxes_in_view(
     patch: np.ndarray,
     group: np.ndarray,
     least: np.ndarray,
-) -> Sight:
-    """Extents of the seen patches in every view, per position and object.
+) -> Detections:
+    """Extents of the unoccluded patches in every view, per position and object.
 
     Args:
-      position, patch, group: [V] camera, patch and (camera, object) index of each patch that
-        nothing hides, sorted. least: [P * O] area in view from which an object is visible.
+      position, patch, group: [V] index of camera, patch and (camera, object) of each patch that
+        nothing hides, sorted.
+      least: [P * O] area in view from which on an object counts as visible.
     """
     area, owner = patches.area[patch], patches.owner[patch]
     center, corner, eye = (a.astype(np.float32) for a in (patches.center, patches.corner, cameras))
     x, up, z = (center[patch, axis] - eye[position, axis] for axis in range(3))
     corners, eyes = turned(corner[..., 0], corner[..., 2]), turned(eye[:, 0], eye[:, 2])
     corners_up, eyes_up = np.ascontiguousarray(corner[..., 1]), np.ascontiguousarray(eye[:, 1])
-    parts = [_nothing()]
+    parts = [_no_detections()]
     for heading, (right, ahead) in enumerate(turned(x, z)):
         for horizon in range(HORIZONS):
             height, depth = tilted(up, ahead, horizon)
@@ -164,11 +157,11 @@ def _boxes_in_view(
             state = poses.join(position[first], heading, horizon)
             box = _extents(across, *tilted(over, along, horizon), start)
             visible = np.add.reduceat(area[rows], start) >= least[group[first]]
-            parts.append(Sight(state, owner[first], box, visible))
+            parts.append(Detections(state, owner[first], box, visible))
     order = np.lexsort(
         (np.concatenate([p.owner for p in parts]), np.concatenate([p.state for p in parts]))
     )
-    return Sight(
+    return Detections(
         state=np.concatenate([p.state for p in parts])[order].astype(np.int32),
         owner=np.concatenate([p.owner for p in parts])[order].astype(np.int32),
         box=np.concatenate([p.box for p in parts])[order],
@@ -176,15 +169,15 @@ def _boxes_in_view(
     )
 
 
-def _nothing() -> Sight:
+def _no_detections() -> Detections:
     none = np.zeros(0, np.int32)
-    return Sight(none, none, np.zeros((0, 4), np.int16), np.zeros(0, bool))
+    return Detections(none, none, np.zeros((0, 4), np.int16), np.zeros(0, bool))
 
 
 def _extents(
     across: np.ndarray, height: np.ndarray, depth: np.ndarray, start: np.ndarray
 ) -> np.ndarray:
-    """Image boxes [M, 4] around the corners [V, 4] of the patches from each of `start` [M] on."""
+    """Image boxes [M, 4] around corners [V, 4] of patches; box m takes those from `start[m]` on."""
     x, y = project(across, depth), -project(height, depth)
     sides = [
         op.reduceat(op(op(a[:, 0], a[:, 1]), op(a[:, 2], a[:, 3])), start)

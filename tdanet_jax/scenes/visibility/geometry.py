@@ -13,11 +13,11 @@ from tdanet_jax.poses import GRID_SIZE, HORIZONS, ROTATIONS, STEPS
 
 
 def box_frame(box: np.ndarray, corners: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """An object's tightest known box as origin corner [3] and edge vectors [3, 3] (rows).
+    """The oriented box of an object, or its axis-aligned one: a corner [3] and edges [3, 3] (rows).
 
     Args:
-      box: [2, 3] axis-aligned box. corners: [8, 3] of the oriented box in AI2-THOR's order
-        (bottom face around, then top face around), if it is known.
+      box: [2, 3] axis-aligned box.
+      corners: [8, 3] of the oriented box, if known: around the bottom face, then around the top.
     """
     if corners is None:
         return box[0], np.diag(box[1] - box[0])
@@ -25,9 +25,9 @@ def box_frame(box: np.ndarray, corners: np.ndarray | None) -> tuple[np.ndarray, 
 
 
 def next_positions(points: np.ndarray) -> np.ndarray:
-    """Where MoveAhead leads from each of `points` [P, 3] along each heading: [P, 8] int32.
+    """The position after MoveAhead from each of `points` [P, 3] along each heading: [P, 8] int32.
 
-    A step to a place that is not reachable leaves the agent where it is.
+    A step towards a point that is not reachable leaves the agent where it is.
     """
     cells = np.rint((points - points[0])[:, [0, 2]] / GRID_SIZE).astype(np.int64)
     index = {(int(x), int(z)): i for i, (x, z) in enumerate(cells)}
@@ -55,14 +55,14 @@ def transitions(next_position: np.ndarray) -> np.ndarray:
 
 
 def action_distances(successor: np.ndarray, goals: np.ndarray) -> np.ndarray:
-    """Fewest actions from each state to a goal state, -1 where there is no way.
+    """Fewest actions from each state to a goal state, -1 where none leads to one.
 
     Args:
       successor: [S, A] int, state after each action.
       goals: [S, G] bool, goal states of each of G <= 64 targets.
 
     Returns:
-      [S, G] int16. All targets advance together: one bit of a word each.
+      [S, G] int16. The searches of all targets run together, one bit of a word each.
     """
     count = goals.shape[1]
     bits = np.uint64(1) << np.arange(count, dtype=np.uint64)
@@ -84,7 +84,8 @@ def lattice(origins: np.ndarray, edges: np.ndarray, steps: int = 8) -> np.ndarra
     """Centres of the steps^3 cells of each of O boxes: [O, K, 3].
 
     Args:
-      origins: [O, 3] a corner of each box. edges: [O, 3, 3] its edge vectors.
+      origins: [O, 3] a corner of each box.
+      edges: [O, 3, 3] its edge vectors.
     """
     share = (np.arange(steps) + 0.5) / steps
     cells = np.stack(np.meshgrid(share, share, share, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -92,15 +93,16 @@ def lattice(origins: np.ndarray, edges: np.ndarray, steps: int = 8) -> np.ndarra
 
 
 def frustum_rotation(points: np.ndarray, visible: np.ndarray, camera: np.ndarray) -> int:
-    """The likeliest rotation, of 0, 90, 180, 270 degrees, of a level camera with 90-degree view.
+    """The likeliest rotation, of 0, 90, 180, 270 degrees, of a level camera with a 90-degree view.
 
-    Only the view's four planes count: an object is taken to be visible as probably as a random
-    point of it lies in the view. Occlusion plays no part, so that the choice does not depend on
-    the rules that are judged by these flags. Ties go to the least rotation.
+    Only the frustum counts: the probability that an object is visible is taken to be the share of
+    it that lies inside. Occlusion plays no part, so that the choice does not depend on the rules
+    that these flags are used to judge. Ties go to the smallest rotation.
 
     Args:
       points: [O, K, 3] points spread over each object within reach, metres.
-      visible: [O] bool, AI2-THOR's flags. camera: [3] metres.
+      visible: [O] bool, AI2-THOR's flags.
+      camera: [3] metres.
     """
     offset = points - camera
     scores = []

@@ -1,6 +1,6 @@
-"""A coarse picture of a view: which class fills each cell of a 7 x 7 grid over the image.
+"""A coarse image of a view: the class in each cell of a 7 x 7 grid.
 
-It stands in for the convolutional feature maps that image-based models expect.
+It replaces the convolutional feature maps that image-based models expect.
 """
 
 from __future__ import annotations
@@ -13,13 +13,16 @@ CELLS = 7  # along each side of the image
 def paint(
     state: np.ndarray, box: np.ndarray, label: np.ndarray, states: int, size: int
 ) -> np.ndarray:
-    """Class of each cell: that of the smallest box over the cell's middle, [states, 7, 7] int8.
+    """Class of the smallest box over the middle of each cell, or -1: [states, 7, 7] int8.
 
-    Small things stand on or before large ones, so boxes are painted from the largest down;
-    later rows cover earlier ones of equal area. A cell under no box holds -1.
+    Small objects stand on or in front of large ones, so boxes are painted from the largest down;
+    among boxes of equal area, later rows cover earlier ones.
 
     Args:
-      state: [N] state of each box. box: [N, 4] x1, y1, x2, y2. label: [N] class, below 128.
+      state: [N] state of each box.
+      box: [N, 4] x1, y1, x2, y2.
+      label: [N] class, below 128.
+      states: number of states.
       size: width and height of the image in the units of `box`.
     """
     box = box.astype(np.int32)

@@ -1,8 +1,8 @@
 """Exact ray casting: does a box lie between a camera and a point?
 
-Everything is in whole millimetres in 32-bit integers and fractions are compared by
-cross-multiplication, where no product reaches 2^31. No rounding means that every machine,
-compiler and version gives the same answer.
+Lengths are whole millimetres in 32-bit integers, and fractions are compared by cross-multiplication
+without a product that reaches 2^31. Nothing is rounded, so every machine, compiler and version
+gives the same answer.
 """
 
 from __future__ import annotations
@@ -15,30 +15,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-RAYS = 1 << 16  # rays cast at once: one shape, one compilation
-MOST_SOLIDS = 256  # of one room
-TURN_BITS = 14  # rotations of oriented boxes are whole numbers of 2^-14
-FARTHEST = 15_000  # millimetres; farther coordinate differences could overflow
+RAYS = 1 << 16  # rays in a batch: one shape, so one compilation
+MOST_SOLIDS = 256  # in one room
+TURN_BITS = 14  # rotations of oriented boxes are multiples of 2^-14
+FARTHEST = 15_000  # millimetres; larger coordinate differences could overflow
 
 OPEN, CLOSED = 0, 1
 
 
 @dataclass(frozen=True, eq=False)
 class Solids:
-    """K boxes that hide things: those along the world's axes first, then those that are turned.
+    """K occluding boxes: first those aligned with the world's axes, then the oriented ones.
 
-    Millimetres, int32. A turned box is given in a frame of its own, around `origin`.
+    Millimetres, int32. An oriented box is given in its own frame, around `origin`.
     """
 
     lo: np.ndarray  # [K, 3]
     hi: np.ndarray  # [K, 3]
-    kind: np.ndarray  # [K] OPEN or CLOSED: whether it hides points inside it
+    kind: np.ndarray  # [K] OPEN or CLOSED; a closed box also hides what is inside it
     origin: np.ndarray  # [K, 3]
-    turn: np.ndarray  # [K, 3, 3], rows are the box's axes times 2^14
-    aligned: int  # how many of the K lie along the world's axes
+    turn: np.ndarray  # [K, 3, 3], rows are the axes of the box times 2^14
+    aligned: int  # how many of the K are aligned with the world's axes
 
 
-# One array [N] for each axis: XLA vectorises these loops only without an axis of length three.
+# One array [N] per axis: XLA does not vectorise these loops over an axis of length three.
 Vectors = tuple[jax.Array, jax.Array, jax.Array]
 
 
@@ -47,12 +47,13 @@ def blocked_by_box(
 ) -> jax.Array:
     """Whether a box hides the ends of the segments from `camera` along `ray`: [N] bool.
 
-    A segment meets the open box where, for every pair of axes, it enters along one before it
-    leaves along the other. It is blocked if it passes through or ends inside a closed box.
-    Touching is not meeting.
+    A segment meets the open box if, for every pair of axes, it enters along one before it leaves
+    along the other. It is blocked if it passes through, or ends inside a closed box. A segment
+    that only touches the box does not meet it.
 
     Args:
-      lo, hi: [3] corners of the box. kind: scalar. All int32, below 2^15 in size.
+      lo, hi: [3] corners of the box.
+      kind: OPEN or CLOSED. All are int32 with magnitudes below 2^15.
     """
     step = [jnp.abs(ray[a]) for a in range(3)]
     ahead = [ray[a] >= 0 for a in range(3)]
@@ -65,7 +66,7 @@ def blocked_by_box(
     for i, j in ((0, 1), (1, 2), (2, 0)):
         overlap = enter[i] * step[j] < leave[j] * step[i]
         overlap &= enter[j] * step[i] < leave[i] * step[j]
-        hit &= overlap | ((step[i] | step[j]) == 0)  # along the third axis: nothing to compare
+        hit &= overlap | ((step[i] | step[j]) == 0)  # parallel to the third axis
     return hit & (through | (kind == CLOSED))
 
 

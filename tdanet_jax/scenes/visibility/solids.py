@@ -1,4 +1,4 @@
-"""From a room's objects to what rays are cast at and what stops them, as the rules say."""
+"""The patches of a room that rays are cast at, and the solids that stop them, by the rules."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from tdanet_jax.scenes.visibility.geometry import box_frame
 from tdanet_jax.scenes.visibility.rays import CLOSED, FARTHEST, MOST_SOLIDS, OPEN, TURN_BITS, Solids
 from tdanet_jax.scenes.visibility.rules import Rules
 
-THIN = 1e-3  # metres; edges shorter than this have no direction of their own
-CELL = 0.25  # metres, of the plan in which voids are looked for
-BELOW, ABOVE = 1.0, 3.0  # metres under and over the agent's y that walls reach
+THIN = 1e-3  # metres; an edge shorter than this has no direction
+CELL = 0.25  # metres, cell of the floor plan in which voids are found
+BELOW, ABOVE = 1.0, 3.0  # metres that walls extend below and above the agent's y
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """The pieces that a room's object surfaces are divided into; Q of them, sorted by object."""
+    """The Q patches that the surfaces of a room's objects are divided into, sorted by object."""
 
     owner: np.ndarray  # [Q] index of the object
     center: np.ndarray  # [Q, 3] float64 millimetres
     corner: np.ndarray  # [Q, 4, 3] float64 millimetres
-    normal: np.ndarray  # [Q, 3] float64, outward, its length without meaning
+    normal: np.ndarray  # [Q, 3] float64, outward, not normalised
     area: np.ndarray  # [Q] int64 square millimetres
 
 
@@ -34,18 +34,18 @@ def millimetres(lengths: np.ndarray) -> np.ndarray:
 
 
 def fronts_of(item: SceneObject, points: np.ndarray, nearly: float) -> list[tuple[int, int]]:
-    """Axis (0 or 2) and side (0 or 1) of the upright faces of an object's box that look at a room.
+    """Axis (0 or 2) and side (0 or 1) of the upright faces of an object's box towards the room.
 
-    That is the face with the nearest of `points` [P, 3] straight before it, and those whose
-    nearest is at most `nearly` farther. What a point lies beside the face counts double.
+    These are the face with the closest of `points` [P, 3] in front of it, and those whose closest
+    is at most `nearly` farther. Distance to the side of a face counts double.
     """
     found = []
     for axis, across in ((0, 2), (2, 0)):
-        beside = np.maximum(item.box[0, across] - points[:, across], 0)
-        beside = np.maximum(beside, points[:, across] - item.box[1, across])
+        sideways = np.maximum(item.box[0, across] - points[:, across], 0)
+        sideways = np.maximum(sideways, points[:, across] - item.box[1, across])
         for side in (0, 1):
-            before = (points[:, axis] - item.box[side, axis]) * (2 * side - 1)
-            gaps = (before + 2 * beside)[before > 0]
+            ahead = (points[:, axis] - item.box[side, axis]) * (2 * side - 1)
+            gaps = (ahead + 2 * sideways)[ahead > 0]
             if len(gaps):
                 found.append((float(gaps.min()), axis, side))
     least = min(found, default=(0.0, 0, 0))[0]
@@ -53,7 +53,7 @@ def fronts_of(item: SceneObject, points: np.ndarray, nearly: float) -> list[tupl
 
 
 def patches_of(scene: Scene, rules: Rules) -> Patches:
-    """Divide the visible faces of every object into patches."""
+    """Divides the faces of every object that can be seen into patches."""
     parts = []
     for index, item in enumerate(scene.objects):
         origin, edges = box_frame(item.box, item.corners)
@@ -70,7 +70,7 @@ def patches_of(scene: Scene, rules: Rules) -> Patches:
             corner = corner + grid[..., :1] * edges[u] + grid[..., 1:] * edges[v]
             area = np.rint(lengths[u] * lengths[v] / len(grid) * 1e6)
             if item.object_class in rules.carved:
-                corner = corner[~stood_on(corner.mean(axis=1), scene.points, rules.standing)]
+                corner = corner[~near_any(corner.mean(axis=1), scene.points, rules.standing)]
             normal = np.broadcast_to(edges[axis] * (2 * side - 1), (len(corner), 3))
             parts.append((index, corner, normal, area))
     sizes = [len(corner) for _, corner, _, _ in parts]
@@ -84,24 +84,24 @@ def patches_of(scene: Scene, rules: Rules) -> Patches:
     )
 
 
-def stood_on(places: np.ndarray, points: np.ndarray, radius: float) -> np.ndarray:
-    """Whether each of `places` [N, 3] is within `radius` of one of `points`, horizontally."""
+def near_any(places: np.ndarray, points: np.ndarray, radius: float) -> np.ndarray:
+    """Whether each of `places` [N, 3] is within `radius` of any of `points`, horizontally."""
     offset = (places[:, None] - points)[:, :, [0, 2]]
     return ((offset * offset).sum(axis=-1) < radius**2).any(axis=1)
 
 
 def _unit_grid(m: int, n: int) -> np.ndarray:
-    """Corners of an m x n division of the unit square: [m * n, 4, 2]."""
+    """Corners of the m x n cells of the unit square: [m * n, 4, 2]."""
     i, j = np.meshgrid(np.arange(m), np.arange(n), indexing="ij")
     low = np.stack([i, j], axis=-1).reshape(-1, 1, 2)
     return (low + np.array([(0, 0), (0, 1), (1, 0), (1, 1)])) / np.array([m, n])
 
 
 def solids_of(scene: Scene, rules: Rules) -> Solids:
-    """The boxes of a room that hide things.
+    """The occluding boxes of a room.
 
     Raises:
-      SceneError: the room is too large or too full for exact 32-bit ray casting.
+      SceneError: the room is too large, or has too many, for exact 32-bit ray casting.
     """
     aligned = [(box, OPEN) for box in void_boxes(scene, rules)]
     turned = []
@@ -125,15 +125,15 @@ def solids_of(scene: Scene, rules: Rules) -> Solids:
     boxes += [np.stack([-lengths, lengths]) * (0.5 - inset) for _, _, lengths, inset, _ in turned]
     corners = millimetres(np.reshape(boxes, (-1, 2, 3)))
     _check_size(scene, len(boxes))
-    none = len(aligned)
-    turns = [np.eye(3)] * none + [edges / lengths[:, None] for _, edges, lengths, _, _ in turned]
+    plain = len(aligned)
+    turns = [np.eye(3)] * plain + [edges / lengths[:, None] for _, edges, lengths, _, _ in turned]
     return Solids(
         lo=corners[:, 0],
         hi=corners[:, 1],
         kind=np.array([kind for _, kind in aligned] + [t[4] for t in turned], np.int32),
-        origin=millimetres(np.reshape([np.zeros(3)] * none + [t[0] for t in turned], (-1, 3))),
+        origin=millimetres(np.reshape([np.zeros(3)] * plain + [t[0] for t in turned], (-1, 3))),
         turn=np.rint(np.reshape(turns, (-1, 3, 3)) * (1 << TURN_BITS)).astype(np.int32),
-        aligned=none,
+        aligned=plain,
     )
 
 
@@ -147,14 +147,14 @@ def _check_size(scene: Scene, solids: int) -> None:
 
 
 def void_boxes(scene: Scene, rules: Rules) -> list[np.ndarray]:
-    """Boxes [2, 3] over the parts of the plan far from all objects and points: walls, or what
-    lies behind them.
+    """Boxes [2, 3] over the parts of the floor plan far from all objects and points: walls, and
+    what is behind them.
 
-    The plan is cut into cells; runs of void cells along x make one box each, equal runs in
+    The plan is divided into cells. A run of void cells along x becomes one box, and equal runs in
     successive rows are joined.
     """
     boxes = np.array([item.box for item in scene.objects])[:, :, [0, 2]]
-    boxes = boxes[np.isfinite(boxes).all(axis=(1, 2))]  # imported objects may have no known place
+    boxes = boxes[np.isfinite(boxes).all(axis=(1, 2))]  # NaN: an unknown place
     ground = scene.points[:, [0, 2]]
     low = np.minimum(boxes[:, 0].min(axis=0, initial=np.inf), ground.min(axis=0))
     high = np.maximum(boxes[:, 1].max(axis=0, initial=-np.inf), ground.max(axis=0))
@@ -174,12 +174,12 @@ def void_boxes(scene: Scene, rules: Rules) -> list[np.ndarray]:
                 (low[0] + j * CELL, top, low[1] + last * CELL),
             ]
         )
-        for i, j, first, last in _runs(void)
+        for i, j, first, last in _rectangles(void)
     ]
 
 
-def _runs(mask: np.ndarray) -> list[tuple[int, int, int, int]]:
-    """Rectangles [i, j) x [first, last) that cover the true cells of `mask` once each."""
+def _rectangles(mask: np.ndarray) -> list[tuple[int, int, int, int]]:
+    """Rectangles [i, j) x [first, last) that together cover each true cell of `mask` once."""
     done: list[tuple[int, int, int, int]] = []
     growing: dict[tuple[int, int], int] = {}
     for column in range(mask.shape[1] + 1):

@@ -42,8 +42,8 @@ def path(tmp_path: Path) -> Path:
     ("name", "reason"),
     [("external link", "link"), ("soft link", "link"), ("elsewhere", "another file"),
      ("virtual", "another file"), ("huge", "1000000000000 numbers"), ("wide", "8388608 numbers"),
-     ("text", "no numbers"), ("objects", "no numbers"), ("nan", "NaN"), ("group", "not a dataset"),
-     ("szip", "compressed"), ("missing", "link")],
+     ("text", "not numeric"), ("objects", "not numeric"), ("nan", "NaN"),
+     ("group", "not a dataset"), ("szip", "compression filter"), ("missing", "link")],
 )  # fmt: skip
 def test_what_is_refused(path: Path, name: str, reason: str) -> None:
     with hdf5.opened(path) as reader, pytest.raises(FileError, match=rf"a\.h5: {name} .*{reason}"):

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
-from tdanet_jax.scenes import SceneTables, tables
+from tdanet_jax.scenes import SceneTables, tabulation
 from tdanet_jax.scenes.checks import survey
+from tdanet_jax.scenes.visibility.rules import RULES as PUBLISHED
 from tests.support import toy
 
-RULES = dataclasses.replace(tables.RULES, void=100.0)  # toy rooms have no walls
+RULES = dataclasses.replace(PUBLISHED, void=100.0)  # toy rooms have no walls
 
 
 def test_targets_out_of_reach() -> None:
@@ -16,24 +17,24 @@ def test_targets_out_of_reach() -> None:
     fridge = toy.thing("Fridge", (0.0, 1.0, 1.0), (0.6, 2.0, 0.6))
     closed = toy.room(toy.line(1), fridge, toy.thing("Mug", (0.0, 1.0, 1.0)), name="Closed")
     near = toy.room(toy.line(1), toy.thing("Apple", (0.0, 1.5, 1.0)), name="Near")
-    found = survey.unfindable(tables.build([far, closed, near], rules=RULES))
+    found = survey.invisible_targets(tabulation.build([far, closed, near], rules=RULES))
     assert [(case.scene, case.target) for case in found] == [("Far", "Apple"), ("Closed", "Mug")]
     assert found[0].reason.startswith("2.40 m from")
     assert "closed" in found[1].reason
 
 
-def test_parts() -> None:
+def test_disconnected_rooms() -> None:
     apple = toy.thing("Apple", (0.0, 1.5, 1.0))
     whole = toy.room(toy.line(3), apple, name="Whole")
     split = toy.room(toy.points((0, 0), (0, 0.25), (0, 0.75), (1, 1)), apple, name="Split")
-    assert survey.parts(tables.build([whole, split], rules=RULES)) == {"Split": 3}
+    assert survey.disconnected_rooms(tabulation.build([whole, split], rules=RULES)) == {"Split": 3}
 
 
 def test_bundled_rooms(ithor: SceneTables) -> None:
-    assert set(survey.parts(ithor)) == {
+    assert set(survey.disconnected_rooms(ithor)) == {
         f"FloorPlan{number}" for number in (29, 204, 205, 208, 211, 229, 321)
     }
-    lost = survey.unfindable(ithor)
+    lost = survey.invisible_targets(ithor)
     assert len(lost) == 27
     far = {(case.scene, case.target) for case in lost if "nearest" in case.reason}
     assert far == {

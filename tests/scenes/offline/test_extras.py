@@ -101,7 +101,7 @@ def test_broken_graphs(tmp_path: Path) -> None:
     names, matrix = tmp_path / "objects.txt", tmp_path / "adjmat.dat"
     for text, value, reason in (
         ("A\nB\n", np.eye(3), r"adjmat\.dat: shape \(3, 3\) is not that of 2 classes"),
-        ("A\nA\n", np.eye(2), r"objects\.txt: not a list of different class names"),
+        ("A\nA\n", np.eye(2), r"objects\.txt: not a list of distinct class names"),
         ("", np.eye(0), r"objects\.txt: not a list"),
         ("A\nB\n", np.full((2, 2), np.nan), r"adjmat\.dat: holds NaN"),
         ("A\nB\n", -np.eye(2), r"adjmat\.dat: holds .* a weight below 0"),
@@ -136,7 +136,7 @@ def test_broken_episodes(tmp_path: Path, rooms: Rooms) -> None:
             (good, "not a list of episodes"),
             ([3], "episode 0: no scene, state and goal_object_type"),
             ([{**good, "scene": "../../etc/passwd"}], "is not an iTHOR scene"),
-            ([{**good, "state": {"x": 0}}], "its state is no ThorAgentState"),
+            ([{**good, "state": {"x": 0}}], "its state is not a ThorAgentState"),
             ([{**good, "glove_embedding": "text"}], "something other than an array"),
             ([off], "is not on the grid"),
             ([turned], "rotation or horizon"),

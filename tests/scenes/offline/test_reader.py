@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tdanet_jax.io.untrusted import FileError
-from tdanet_jax.scenes.offline import layout, reader
+from tdanet_jax.scenes.offline import layout, matching, reader
 from tdanet_jax.scenes.offline.reader import SceneData
 from tests.support import original
 from tests.support.original import APPLE, KEYS, MUG, TABLE
@@ -38,14 +38,14 @@ def rows(data: SceneData) -> set[tuple[int, str, tuple[float, ...], bool]]:
     """State, object, box in pixels, and whether it is visible, of every row."""
     return {
         (int(s), data.scene.objects[o].object_id, tuple((b / 16).tolist()), bool(v))
-        for s, o, b, v in zip(*vars(data.sight).values(), strict=True)
+        for s, o, b, v in zip(*vars(data.detections).values(), strict=True)
     }
 
 
 def test_the_miniature_by_hand(folder: Path) -> None:
     data = read(folder)
     assert data.scene.points.tolist() == [[-0.001, 0.9, 0.25 * i] for i in range(3)]
-    nowhere = tuple(value / 16 for value in reader.NO_BOX)
+    nowhere = tuple(value / 16 for value in matching.NO_BOX)
     assert rows(data) == {
         (16, MUG, (140, 150, 160, 170), False),
         (16, TABLE, (100, 160, 200, 300), True),
@@ -60,8 +60,8 @@ def test_the_miniature_by_hand(folder: Path) -> None:
     places = {item.object_id: item.box[0].tolist() for item in data.scene.objects}
     assert places[MUG] == [0.0, 1.0, 1.5]
     assert np.isnan(places[APPLE]).all()
-    assert "3 points, visible_object_map.json (3 objects)" in reader.describe(data)
-    assert "1 times an object is visible and has no box" in reader.describe(data)
+    assert "3 points, visible_object_map.json (3 objects)" in data.describe()
+    assert "1 times an object is visible and has no box" in data.describe()
 
 
 def test_links_by_name_and_links_called_edges_are_the_same(folder: Path) -> None:
@@ -149,8 +149,8 @@ def test_the_name_with_the_distance_goes_first(folder: Path) -> None:
 def test_without_boxes_there_is_visibility_alone(folder: Path) -> None:
     (folder / "objects_bb.json").unlink()
     data = read(folder)
-    assert (data.sight.box == reader.NO_BOX).all()
-    assert data.sight.visible.tolist() == [True] * 3
+    assert (data.detections.box == matching.NO_BOX).all()
+    assert data.detections.visible.tolist() == [True] * 3
     assert "no objects_bb.json, so no detections" in data.noted
 
 
@@ -205,15 +205,15 @@ BAD: list[tuple[str, Any, str]] = [
     ("graph.json", lambda c: c["nodes"].append({"id": "-0.00|0.00|50|0"}), "rotation or horizon"),
     ("graph.json", lambda c: c["nodes"].append({"id": "-0.00|0.00|0|60"}), "rotation or horizon"),
     ("graph.json", lambda c: c["nodes"].append({"id": "../../x"}), "is not x|z|rotation|horizon"),
-    ("graph.json", lambda c: c["nodes"].append({"id": 7}), "a state key that is no text"),
+    ("graph.json", lambda c: c["nodes"].append({"id": 7}), "a state key that is not text"),
     ("visible_object_map.json", lambda c: c.update({MUG: ["9.00|0.00|0|0"]}), "not on the grid"),
     ("visible_object_map.json", lambda c: c.update({MUG: 3}), "neither a list of states"),
     ("visible_object_map.json", lambda c: {KEYS[0]: {"objects": [3]}}, "an object without"),
     ("visible_object_map.json", lambda c: {"": []}, "an object without a name"),
     ("objects_bb.json", lambda c: c.update({"9.00|0.00|0|0": {}}), "is not on the grid"),
     ("objects_bb.json", lambda c: c.update({KEYS[0]: []}), "not classes with boxes"),
-    ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug": [1, 2, 3]}}), "four numbers a box"),
-    ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug": [0, 0, 1, None]}}), "is no number"),
+    ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug": [1, 2, 3]}}), "four numbers per box"),
+    ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug": [0, 0, 1, None]}}), "is not a number"),
     ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug": [0, 0, 1, 302]}}), "not in the image"),
 ]  # fmt: skip
 

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from tdanet_jax import words
 from tdanet_jax.env.reward import find_parents, named_parents, published_parents
 from tdanet_jax.io.untrusted import FileError, hdf5
-from tdanet_jax.scenes import SceneTables, dataset, tables
-from tdanet_jax.scenes.offline import exporter, importer, reader
+from tdanet_jax.scenes import SceneTables, dataset, tabulation
+from tdanet_jax.scenes.offline import exporter, features, importer, layout, reader
 from tdanet_jax.scenes.offline.layout import OBJECT_FILE, state_keys
 from tdanet_jax.splits import make_split
 from tdanet_jax.vocabulary import TARGETS
@@ -35,7 +35,7 @@ def cache_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def assert_equal(ours: SceneTables, theirs: SceneTables) -> None:
     """Equal but for classes that do not occur and targets that are none."""
-    whole = dataset.with_known_targets(ours)
+    whole = ours.with_known_targets()
     for field in dataclasses.fields(SceneTables):
         a, b = getattr(whole, field.name), getattr(theirs, field.name)
         if field.name == "object_class":
@@ -59,7 +59,7 @@ def test_out_and_in_is_the_identity(some_rooms: SceneTables, tmp_path: Path) -> 
     assert sorted(path.name for path in (tmp_path / "cache").glob("import-*/*")) == [
         "FloorPlan29.npz", "FloorPlan321.npz", "FloorPlan428.npz"
     ]  # fmt: skip
-    importer.forget(tmp_path / "out")
+    importer.clear_cache(tmp_path / "out")
     assert list((tmp_path / "cache").iterdir()) == []
 
 
@@ -96,7 +96,7 @@ def test_the_layout_alone_holds_transitions_visibility_and_boxes(
 @settings(max_examples=8)
 def test_random_rooms(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     draw = np.random.default_rng(seed)
-    room = tables.build([toy.random_room(draw, name="FloorPlan5")])
+    room = tabulation.build([toy.random_room(draw, name="FloorPlan5")])
     room = dataclasses.replace(room, room_type=np.zeros(1, np.int8))
     folder = tmp_path_factory.mktemp("random") / "FloorPlan5"
     folder.mkdir()
@@ -165,17 +165,17 @@ def test_what_older_code_reads(some_rooms: SceneTables, tmp_path: Path) -> None:
     stored = words.load_word_vectors(out / "thor_glove" / "glove_map50d.hdf5")
     np.testing.assert_allclose(stored.table(room.classes), glove.table(room.classes), atol=1e-6)
 
-    sources = importer.find_features(out)
-    importer.save(dataset.Rooms(room, None), tmp_path / "a.npz", sources, silent)
-    loaded = importer.load_features(tmp_path / "a.npz", room)
+    sources = features.find_features(out)
+    features.save_with_maps(dataset.Rooms(room, None), tmp_path / "a.npz", sources, silent)
+    loaded = features.load_features(tmp_path / "a.npz", room)
     assert loaded.shape == (room.num_states, 512, 7, 7)
     assert loaded.dtype == np.float16
     np.testing.assert_array_equal(np.where(loaded[5].any(0), loaded[5].argmax(0), -1),
                                   room.raster[5])  # fmt: skip
-    with pytest.raises(FileError, match="the maps of other rooms"):
-        importer.load_features(tmp_path / "a.npz", some_rooms)
+    with pytest.raises(FileError, match="not the maps of these rooms"):
+        features.load_features(tmp_path / "a.npz", some_rooms)
     with pytest.raises(FileError, match=r"b\.features\.npy: no such file"):
-        importer.load_features(tmp_path / "b.npz", room)
+        features.load_features(tmp_path / "b.npz", room)
 
 
 def test_broken_features_leave_nothing_behind(some_rooms: SceneTables, tmp_path: Path) -> None:
@@ -183,7 +183,7 @@ def test_broken_features_leave_nothing_behind(some_rooms: SceneTables, tmp_path:
     room = some_rooms.subset(["FloorPlan428"])
     exporter.write_folder(room, tmp_path / "out", silent)
     with pytest.raises(FileError, match=r"featuremap\.hdf5: no such file"):
-        importer.find_features(tmp_path / "out")
+        features.find_features(tmp_path / "out")
     for name, data, reason in (
         (state_keys(room.position)[0], np.full((512, 7, 7), np.nan), "NaN"),
         (state_keys(room.position)[0], np.full((512, 7, 7), 1e6), "half precision"),
@@ -193,10 +193,10 @@ def test_broken_features_leave_nothing_behind(some_rooms: SceneTables, tmp_path:
         with h5py.File(tmp_path / "out/FloorPlan428/resnet18_featuremap.hdf5", "w") as file:
             file[name] = data
         with pytest.raises(FileError, match=rf"featuremap\.hdf5: .*{reason}"):
-            importer.save(
+            features.save_with_maps(
                 dataset.Rooms(room, None),
                 tmp_path / "a.npz",
-                importer.find_features(tmp_path / "out"),
+                features.find_features(tmp_path / "out"),
                 silent,
             )
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out"]
@@ -215,7 +215,7 @@ def test_parents_go_out_and_in(ithor: SceneTables) -> None:
 def test_a_stopped_import_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = original.write_all(tmp_path / "original")
     whole = importer.read_folder(source, silent).tables
-    importer.forget(source)
+    importer.clear_cache(source)
     read: list[str] = []
     plain = reader.read_scene
 
@@ -250,21 +250,21 @@ def test_scenes_that_changed_since_are_read_anew(
         (3, lambda: (parts / "FloorPlan1.npz").write_bytes(b"damaged")),
     ):
         change()
-        data = importer._read_or_recall(parts, place, "FloorPlan1", 0)
+        data = importer._read_cached(parts, place, "FloorPlan1", 0)
         assert len(read) == times
-        assert len(data.sight.state) == 6
+        assert len(data.detections.state) == 6
 
 
 def test_folders_that_hold_no_scenes(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no folders FloorPlan1 to FloorPlan430"):
-        importer.find_root(tmp_path / "nowhere")
+        layout.find_root(tmp_path / "nowhere")
     (tmp_path / "FloorPlan501").mkdir()
     with pytest.raises(FileError, match="no folders FloorPlan1 to FloorPlan430"):
-        importer.find_root(tmp_path)
+        layout.find_root(tmp_path)
     (tmp_path / "FloorPlan1").mkdir()
     (tmp_path / "FloorPlan1_physics").mkdir()
     with pytest.raises(FileError, match="FloorPlan1 is there twice"):
-        importer.find_scenes(importer.find_root(tmp_path))
+        layout.find_scenes(layout.find_root(tmp_path))
 
 
 @pytest.mark.slow

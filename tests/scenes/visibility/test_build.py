@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tdanet_jax.scenes import ithor
-from tdanet_jax.scenes.checks import agreement
+from tdanet_jax.scenes.checks import agreement, dense_rays
 from tdanet_jax.scenes.scene import Scene, SceneObject
-from tdanet_jax.scenes.visibility.build import look_around
+from tdanet_jax.scenes.visibility.build import detect
 from tdanet_jax.scenes.visibility.rules import RULES, Rules
 from tdanet_jax.scenes.visibility.solids import fronts_of, patches_of, solids_of, void_boxes
 from tests.support import toy
@@ -25,10 +25,10 @@ def seen(
     scene: Scene, position: int, heading: int, horizon: int = 0, rules: Rules = BARE
 ) -> dict[str, tuple[np.ndarray, bool]]:
     """Box and visibility of each object seen from a state, by class."""
-    sight = look_around(scene, rules)
-    rows = np.flatnonzero(sight.state == (position * 8 + heading) * 2 + horizon)
+    found = detect(scene, rules)
+    rows = np.flatnonzero(found.state == (position * 8 + heading) * 2 + horizon)
     return {
-        scene.objects[sight.owner[r]].object_class: (sight.box[r], bool(sight.visible[r]))
+        scene.objects[found.owner[r]].object_class: (found.box[r], bool(found.visible[r]))
         for r in rows
     }
 
@@ -161,7 +161,7 @@ def test_voids_keep_clear_of_points_and_objects(seed: int) -> None:
 def test_turning_the_room_turns_the_views(seed: int) -> None:
     scene = toy.random_room(np.random.default_rng(seed))
     turned = quarter_turn(scene)
-    a, b = look_around(scene, BARE), look_around(turned, BARE)
+    a, b = detect(scene, BARE), detect(turned, BARE)
     position, view = np.divmod(a.state, 16)
     moved = position * 16 + (view + 4) % 16  # two headings of 45 degrees, two horizons each
     order = np.lexsort((a.owner, moved))
@@ -206,19 +206,19 @@ def test_boxes_agree_with_dense_rays_in_random_rooms(seed: int) -> None:
     draw = np.random.default_rng(seed)
     scene = toy.random_room(draw)
     states = draw.choice(len(scene.points) * 16, 3, replace=False)
-    overlaps, classes = agreement.compare_boxes(scene, RULES, states)
+    overlaps, classes = dense_rays.compare_boxes(scene, RULES, states)
     assert not overlaps or np.mean(overlaps) > 0.8
-    assert classes.extras + classes.misses <= 1
+    assert classes.errors <= 1
 
 
 def test_boxes_agree_with_dense_rays_in_real_rooms() -> None:
     scenes = ithor.load_scenes()
     draw = np.random.default_rng(0)
     overlaps: list[float] = []
-    total = agreement.Count()
+    total = agreement.Confusion()
     for number in (5, 48, 70, 101):
         states = draw.choice(len(scenes[number].points) * 16, 3, replace=False)
-        more, classes = agreement.compare_boxes(scenes[number], RULES, states)
+        more, classes = dense_rays.compare_boxes(scenes[number], RULES, states)
         overlaps += more
         total += classes
     assert len(overlaps) > 50
@@ -231,5 +231,5 @@ def test_agreement_with_the_published_flags() -> None:
     train = [scene for i, scene in enumerate(scenes) if i % 30 < 20]
     test = [scene for i, scene in enumerate(scenes) if i % 30 >= 20]
     for rooms, least in ((train, 0.95), (test, 0.93)):
-        total = sum(agreement.by_class(rooms, RULES).values(), agreement.Count())
+        total = sum(agreement.by_class(rooms, RULES).values(), agreement.Confusion())
         assert total.f1 > least
