@@ -29,7 +29,7 @@ PARSERS: tuple[tuple[Any, str], ...] = (
 
 
 class Parsed(BaseException):
-    """The arguments are accepted; raised in place of running the command."""
+    """The arguments are accepted; raised instead of running the command."""
 
 
 def lines(code: str) -> Iterator[list[str]]:

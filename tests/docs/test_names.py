@@ -30,7 +30,7 @@ pages = pytest.mark.parametrize("page", PAGES)
 
 
 def code(page: str) -> list[str]:
-    """What stands between single backticks, outside of blocks."""
+    """The inline code of a page."""
     return re.findall(r"`([^`]+)`", prose(page))
 
 

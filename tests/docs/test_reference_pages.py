@@ -41,7 +41,7 @@ def rows(part: str) -> Iterator[list[str]]:
 
 
 def code(part: str) -> list[str]:
-    """What stands between single backticks, outside of blocks."""
+    """The inline code of a part of a page."""
     outside = re.sub(r"^```.*?^```", "", part, flags=re.DOTALL | re.MULTILINE)
     return re.findall(r"`([^`]+)`", outside)
 

@@ -1,4 +1,4 @@
-"""Every Python block of every page runs as it stands, cut short where it trains."""
+"""Every Python block of every page runs unchanged; training is cut short."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def runs(one: Block) -> bool:
 
 @pytest.fixture
 def small_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`tdanet_jax.train` makes two updates of a tiny network, whatever it is asked for."""
+    """`tdanet_jax.train` makes two updates of a tiny network."""
     train = tdanet_jax.train
 
     def briefly(config: TrainConfig, *given: Any, **options: Any) -> Any:
