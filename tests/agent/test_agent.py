@@ -5,6 +5,7 @@ import json
 import shutil
 from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,22 +16,23 @@ from tdanet_jax import config as configs
 from tdanet_jax.agent.agent import Agent, Detection
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.env import dynamics
+from tdanet_jax.env.params import TEST_STEP_LIMITS, make_params
 from tdanet_jax.env.reward import find_parents
 from tdanet_jax.models import actor_critic
-from tdanet_jax.models.classes import Classes, make_classes
-from tdanet_jax.sensors import triangulation
-from tdanet_jax.models.registry import make_model
+from tdanet_jax.models.classes import ClassVocabulary, make_vocabulary
+from tdanet_jax.models.factory import make_model
+from tdanet_jax.sensors.triangulation import no_estimate
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
 from tdanet_jax.vocabulary import TARGETS, Action
-from tests.support import samples
+from tests.support import samples, step_counter
 
 CONFIG = TrainConfig(network=NetworkConfig(width=16, hidden=16, precision="float32"))
 
 
 @pytest.fixture(scope="module")
 def weights(glove):
-    model = make_model(CONFIG, Classes())
+    model = make_model(CONFIG, ClassVocabulary())
     return samples.parameters(model, glove.table(["Mug", "Bed"]))
 
 
@@ -40,31 +42,38 @@ def agent(weights, glove):
 
 
 @pytest.fixture(scope="module")
-def sensing_agent(glove):
-    """An agent that senses its way, and goes by it; it mostly moves ahead."""
-    return going_by_odometry(glove, NetworkConfig(odometry=True))
+def odometry_agent(glove):
+    """An agent with odometry that matters to it; it mostly moves ahead."""
+    return moving_by_odometry(glove, NetworkConfig(odometry=True))
 
 
 @pytest.fixture(scope="module")
-def sighting_agent(glove):
-    """One that senses where its target is, too."""
-    return going_by_odometry(glove, NetworkConfig(odometry=True, triangulation=True))
+def triangulating_agent(glove):
+    """One that triangulates, too."""
+    return moving_by_odometry(glove, NetworkConfig(odometry=True, triangulation=True))
 
 
 @pytest.fixture(scope="module")
 def merging_agent(glove):
-    """One that senses its way, of a model that is shown one box for all objects of a class."""
+    """One with odometry, of a model that is shown one box for all objects of a class."""
     network = NetworkConfig(odometry=True, rows="class")
-    return going_by_odometry(glove, network)
+    return moving_by_odometry(glove, network)
 
 
-def going_by_odometry(glove, network):
+@pytest.fixture(scope="module")
+def counting_agent(glove):
+    """One with odometry and a custom sensor."""
+    return moving_by_odometry(glove, NetworkConfig(odometry=True, sensors=(step_counter.NAME,)))
+
+
+def moving_by_odometry(glove, network):
     network = dataclasses.replace(network, width=16, hidden=16, precision="float32")
     config = dataclasses.replace(CONFIG, network=network)
     words = glove.table(["Mug", "Bed"])
-    weights = samples.going_by_odometry(make_model(config, Classes()), words)
+    weights = samples.moving_by_odometry(make_model(config, ClassVocabulary()), words)
     if network.triangulation:  # nine of its inputs, and mostly zero
-        weights["way"]["kernel"] = weights["way"]["kernel"].at[-9:].multiply(5.0)
+        layer = weights["way"]
+        layer["kernel"] = layer["kernel"].at[-9:].multiply(5.0)
     return Agent(config, weights, glove)
 
 
@@ -75,13 +84,10 @@ def detections_of(tables, pose):
     return [Detection(name, *map(float, box)) for name, box in zip(names, boxes, strict=True)]
 
 
-def decide_alike(agent, some_rooms, glove, merge, rotation=0, steps=3):
+def decide_alike(agent, some_rooms, glove, rotation=0, steps=3):
     """The agent and its network in the environment, side by side; how often it was stopped."""
     parents = find_parents(some_rooms, TARGETS)
-    params = dynamics.make_params(
-        some_rooms, TARGETS, parents, dynamics.TEST_STEP_LIMITS, merge=merge,
-        odometry=agent.model.odometry, triangulation=agent.model.triangulation,
-    )  # fmt: skip
+    params = make_params(some_rooms, TARGETS, parents, TEST_STEP_LIMITS, agent.model.spec)
     model, weights = agent.model, agent.weights
     table = actor_critic.prepare(model, weights, jnp.asarray(glove.table(some_rooms.classes)))
     observe = jax.jit(jax.vmap(dynamics.observe, (0, None)))
@@ -92,18 +98,18 @@ def decide_alike(agent, some_rooms, glove, merge, rotation=0, steps=3):
     position = int(np.flatnonzero(ahead == np.arange(len(ahead)))[9])
     goal = some_rooms.targets.index("Mug")
     one = jnp.array([position * 16 + rotation // 45 * 2]), jnp.array([goal])
-    state = jax.vmap(dynamics.start, (None, 0, 0))(params, *one)
-    carry, previous, fresh = model.initial_carry(1, weights), jnp.zeros((1, 6)), jnp.zeros(1, bool)
-    memory, blocked, stopped = agent.start(rotation), False, 0
+    state = jax.vmap(dynamics.start, (0, 0, None))(*one, params)
+    carry, probs, is_first = model.initial_carry(1, weights), jnp.zeros((1, 6)), jnp.zeros(1, bool)
+    own, blocked, stopped = agent.start(rotation), False, 0
     for key in jax.random.split(jax.random.key(3), steps):
         obs = observe(state, params)
-        carry, out = forward(model, weights, table, carry, obs, previous, fresh)
-        previous = jax.nn.softmax(out.logits)
+        carry, out = forward(model, weights, table, carry, obs, probs, is_first)
+        probs = jax.nn.softmax(out.logits)
         seen, pose = detections_of(some_rooms, int(state.pose[0])), int(state.pose[0])
-        _, greedy = agent.act(memory, seen, "Mug", blocked=blocked)
-        assert greedy.action == Action(int(previous.argmax()))
-        memory, decision = agent.act(memory, seen, "Mug", key, blocked)
-        np.testing.assert_allclose(decision.probabilities, previous[0], rtol=1e-4)
+        _, greedy = agent.act(own, seen, "Mug", blocked=blocked)
+        assert greedy.action == Action(int(probs.argmax()))
+        own, decision = agent.act(own, seen, "Mug", key, blocked)
+        np.testing.assert_allclose(decision.probabilities, probs[0], rtol=1e-4)
         np.testing.assert_allclose(decision.value, out.value[0], rtol=1e-4, atol=1e-6)
         assert decision.action == int(jax.random.categorical(key, out.logits)[0])
         state = transition(state, jnp.array([decision.action]), params).state
@@ -113,74 +119,100 @@ def decide_alike(agent, some_rooms, glove, merge, rotation=0, steps=3):
 
 
 @pytest.mark.parametrize("rotation", [0, 225])
-@pytest.mark.parametrize("who", ["agent", "sighting_agent", "merging_agent"])
+@pytest.mark.parametrize("who", ["agent", "triangulating_agent", "merging_agent", "counting_agent"])
 def test_it_decides_as_the_network_does_in_the_environment(
     some_rooms, glove, who, rotation, request
 ):
     chosen = request.getfixturevalue(who)
-    steps = 25 if chosen.model.odometry else 3
-    merge = who == "merging_agent"
-    stopped = decide_alike(chosen, some_rooms, glove, merge, rotation, steps)
+    assert chosen.model.spec.rows == ("class" if who == "merging_agent" else "object")
+    steps = 25 if chosen.model.spec.sensors else 3
+    stopped = decide_alike(chosen, some_rooms, glove, rotation, steps)
     assert 0 < stopped < steps - 10 or who == "agent"
 
 
-def test_what_an_agent_senses_of_its_target_matters(sensing_agent, sighting_agent):
+def with_estimate(state, estimate):
+    return state._replace(sensors={**state.sensors, "triangulation": estimate})
+
+
+def test_the_estimate_of_the_target_matters(odometry_agent, triangulating_agent):
     """It remembers where the target was, and not where others were."""
     mug, sink = Detection("mug", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.1, 0.1, 0.3, 0.4)
 
-    def trail(agent, seen, target="mug"):
-        memory, _ = agent.act(agent.start(), [sink, seen], target)
-        return memory.trail
+    def sensors(agent, seen, target="mug"):
+        state, _ = agent.act(agent.start(), [sink, seen], target)
+        return state.sensors
 
-    assert trail(sensing_agent, mug).sighting is None
-    known = trail(sighting_agent, mug).sighting
+    assert list(sensors(odometry_agent, mug)) == ["odometry"]
+    known = sensors(triangulating_agent, mug)["triangulation"]
     assert float(known.normal[0, 0]) > 0
-    assert not trail(sighting_agent, sink).sighting.normal.any()
-    memory, _ = sighting_agent.act(sighting_agent.start(), [mug, sink], "mug")
-    memory = memory._replace(action=jnp.int32(Action.MOVE_AHEAD))
-    unseen = memory._replace(trail=memory.trail.replace(sighting=triangulation.begin()))
+    assert not sensors(triangulating_agent, sink)["triangulation"].normal.any()
+    state, _ = triangulating_agent.act(triangulating_agent.start(), [mug, sink], "mug")
+    state = state._replace(action=jnp.int32(Action.MOVE_AHEAD))
+    unseen = with_estimate(state, no_estimate())
     moved, blocked, forgot = (
-        sighting_agent.act(start, [sink], "mug", blocked=stopped)[1].probabilities
-        for start, stopped in ((memory, False), (memory, True), (unseen, False))
+        triangulating_agent.act(start, [sink], "mug", blocked=stopped)[1].probabilities
+        for start, stopped in ((state, False), (state, True), (unseen, False))
     )
     assert np.abs(moved - forgot).max() > 1e-3
     assert np.abs(moved - blocked).max() > 1e-3
 
 
-def test_of_another_target_an_agent_has_never_seen_anything(sighting_agent):
+def test_of_another_target_an_agent_has_never_seen_anything(triangulating_agent):
     mug, sink = Detection("mug", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.6, 0.1, 0.8, 0.4)
-    memory, _ = sighting_agent.act(sighting_agent.start(), [mug, sink], "mug")
-    memory = memory._replace(action=jnp.int32(Action.MOVE_AHEAD))
-    assert memory.trail.sighting.normal.any()
-    never = memory._replace(trail=memory.trail.replace(sighting=triangulation.begin()))
+    state, _ = triangulating_agent.act(triangulating_agent.start(), [mug, sink], "mug")
+    state = state._replace(action=jnp.int32(Action.MOVE_AHEAD))
+    assert state.sensors["triangulation"].normal.any()
+    never = with_estimate(state, no_estimate())
 
-    def after(memory, seen, target):
-        return sighting_agent.act(memory, seen, target, blocked=False)
+    def after(state, seen, target):
+        return triangulating_agent.act(state, seen, target, blocked=False)
 
     for seen, target in (([], "sink"), ([mug, sink], "sink"), ([mug], "toaster")):
-        (kept, one), (fresh, other) = (after(m, seen, target) for m in (memory, never))
+        (kept, one), (new, other) = (after(m, seen, target) for m in (state, never))
         np.testing.assert_array_equal(one.probabilities, other.probabilities)
         assert one.value == other.value
-        for mine, theirs in zip(
-            jax.tree.leaves(kept.trail), jax.tree.leaves(fresh.trail), strict=True
-        ):
-            np.testing.assert_array_equal(mine, theirs)
-        # It remembers its way all the same, and nothing of the mug when it looks for that again.
-        assert tuple(kept.trail.cell) == (0, 1)
+        chex.assert_trees_all_equal(kept.sensors, new.sensors)
+        # It remembers its pose all the same, and nothing of the mug when it looks for that again.
+        assert tuple(kept.sensors["odometry"].cell) == (0, 1)
         back, _ = after(kept._replace(action=jnp.int32(Action.LOOK_UP)), [], "mug")
-        assert not back.trail.sighting.normal.any()
-    # A new label on the way is no other target.
-    same, _ = after(memory, [Detection("vase", 0.6, 0.1, 0.8, 0.4)], "mug")
-    assert same.trail.sighting.normal.any()
+        assert not back.sensors["triangulation"].normal.any()
+    # A new label in between is no other target.
+    same, _ = after(state, [Detection("vase", 0.6, 0.1, 0.8, 0.4)], "mug")
+    assert same.sensors["triangulation"].normal.any()
 
 
-def test_what_an_agent_senses_of_its_way_matters(sensing_agent):
+def test_a_custom_sensor_counts_and_matters(counting_agent):
+    mug, sink = Detection("mug", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.6, 0.1, 0.8, 0.4)
+    state = counting_agent.start(90)
+
+    def counts(state):
+        return {name: int(value) for name, value in state.sensors[step_counter.NAME].items()}
+
+    assert counts(state) == {"actions": 0, "frames": 0, "path": 0, "rotation": 2}
+    state, _ = counting_agent.act(state, [mug], "mug")
+    assert counts(state) == {"actions": 0, "frames": 1, "path": 0, "rotation": 2}
+    state, _ = counting_agent.act(
+        state._replace(action=jnp.int32(Action.MOVE_AHEAD)), [mug, mug, sink], "mug", blocked=False
+    )
+    assert counts(state) == {"actions": 1, "frames": 2, "path": 1, "rotation": 2}
+    turned = state._replace(action=jnp.int32(Action.ROTATE_LEFT))
+    same, decision = counting_agent.act(turned, [sink], "mug")
+    assert counts(same) == {"actions": 2, "frames": 2, "path": 2, "rotation": 2}
+    other, _ = counting_agent.act(turned, [sink], "sink")
+    assert counts(other)["frames"] == 1
+    longer = {**turned.sensors[step_counter.NAME], "actions": jnp.int32(40)}
+    late = turned._replace(sensors={**turned.sensors, step_counter.NAME: longer})
+    changed = counting_agent.act(late, [sink], "mug")[1].probabilities
+    assert np.abs(changed - decision.probabilities).max() > 1e-3
+
+
+def test_odometry_matters(odometry_agent):
     seen = [Detection("sink", 0.1, 0.1, 0.3, 0.4)]
 
     def second(rotation=0, blocked=False, action=Action.MOVE_AHEAD):
-        memory, _ = sensing_agent.act(sensing_agent.start(rotation), seen, "mug")
-        memory = memory._replace(action=jnp.int32(action))
-        return sensing_agent.act(memory, seen, "mug", blocked=blocked)[1].probabilities
+        state, _ = odometry_agent.act(odometry_agent.start(rotation), seen, "mug")
+        state = state._replace(action=jnp.int32(action))
+        return odometry_agent.act(state, seen, "mug", blocked=blocked)[1].probabilities
 
     plain = second()
     for other in (
@@ -196,36 +228,36 @@ def test_what_an_agent_senses_of_its_way_matters(sensing_agent):
     np.testing.assert_array_equal(turned, second(action=Action.ROTATE_LEFT))
 
 
-def test_an_agent_that_senses_nothing_of_its_way_needs_not_be_told(agent):
+def test_an_agent_without_sensors_needs_not_be_told(agent):
     seen = [Detection("sink", 0.1, 0.1, 0.3, 0.4)]
-    assert agent.start(45).trail is None
-    memory, plain = agent.act(agent.start(45), seen, "mug", blocked=True)
+    assert agent.start(45).sensors == {}
+    state, plain = agent.act(agent.start(45), seen, "mug", blocked=True)
     np.testing.assert_array_equal(
         plain.probabilities, agent.act(agent.start(), seen, "mug")[1].probabilities
     )
-    assert memory.trail is None
+    assert state.sensors == {}
 
 
-def test_an_agent_that_senses_its_way_must_be_told_whether_its_move_was_blocked(sensing_agent):
+def test_an_agent_with_sensors_must_be_told_whether_its_move_was_blocked(odometry_agent):
     seen = [Detection("sink", 0.1, 0.1, 0.3, 0.4)]
-    memory, _ = sensing_agent.act(sensing_agent.start(), seen, "mug")
-    moved = memory._replace(action=jnp.int32(Action.MOVE_AHEAD))
+    state, _ = odometry_agent.act(odometry_agent.start(), seen, "mug")
+    moved = state._replace(action=jnp.int32(Action.MOVE_AHEAD))
     with pytest.raises(ValueError, match="whether its MoveAhead was `blocked`"):
-        sensing_agent.act(moved, seen, "mug")
-    turned = memory._replace(action=jnp.int32(Action.ROTATE_LEFT))
-    sensing_agent.act(turned, seen, "mug")
+        odometry_agent.act(moved, seen, "mug")
+    turned = state._replace(action=jnp.int32(Action.ROTATE_LEFT))
+    odometry_agent.act(turned, seen, "mug")
 
 
-def test_a_start_that_looks_down_is_sensed(sensing_agent):
-    assert int(sensing_agent.start(horizon=30).trail.horizon) == 1
-    assert int(sensing_agent.start(45.0001, 0.0).trail.heading) == 1
+def test_odometry_knows_of_a_start_that_looks_down(odometry_agent):
+    assert int(odometry_agent.start(horizon=30).sensors["odometry"].horizon) == 1
+    assert int(odometry_agent.start(45.0001, 0.0).sensors["odometry"].heading) == 1
     with pytest.raises(ValueError, match="horizon 15: neither 0 nor 30"):
-        sensing_agent.start(horizon=15)
+        odometry_agent.start(horizon=15)
 
 
 @pytest.mark.parametrize("rotation", [30, -1, 44.5])
-def test_a_rotation_off_the_eight_is_refused(agent, sensing_agent, rotation):
-    for one in (agent, sensing_agent):
+def test_a_rotation_off_the_eight_is_refused(agent, odometry_agent, rotation):
+    for one in (agent, odometry_agent):
         with pytest.raises(ValueError, match=f"rotation {rotation}: not a multiple of 45"):
             one.start(rotation)
 
@@ -233,7 +265,7 @@ def test_a_rotation_off_the_eight_is_refused(agent, sensing_agent, rotation):
 @pytest.fixture(scope="module")
 def row_agent(some_rooms, glove):
     """An agent with a row per known class, and parameters that make every row matter."""
-    classes = make_classes(some_rooms.classes, {"Toaster", "Laptop", "Bread"})
+    classes = make_vocabulary(some_rooms.classes, {"Toaster", "Laptop", "Bread"})
     config = dataclasses.replace(CONFIG, model="ssnet")
     model = make_model(config, classes)
     words = jnp.asarray(glove.table(some_rooms.classes))
@@ -244,7 +276,8 @@ def row_agent(some_rooms, glove):
 def test_a_model_with_a_row_per_class_is_shown_what_it_was_in_training(
     row_agent, some_rooms, glove
 ):
-    decide_alike(row_agent, some_rooms, glove, merge=True)
+    assert row_agent.model.spec.rows == "class"
+    decide_alike(row_agent, some_rooms, glove)
 
 
 def test_a_model_with_a_row_per_class_sees_known_classes_alone_and_any_target(row_agent):
@@ -262,22 +295,22 @@ def test_a_model_with_a_row_per_class_sees_known_classes_alone_and_any_target(ro
 
 
 def test_a_model_that_sees_an_image_can_be_looked_into_but_not_asked(some_rooms, glove):
-    classes = make_classes(some_rooms.classes, {"Toaster"})
+    classes = make_vocabulary(some_rooms.classes, {"Toaster"})
     network = dataclasses.replace(CONFIG.network, image="raster")
     config = dataclasses.replace(CONFIG, model="baseline", network=network)
     words = glove.table(some_rooms.classes)
     agent = Agent(config, samples.parameters(make_model(config, classes), words), glove, classes)
     assert agent.weights["actor"]["kernel"].shape == (16, 6)
-    with pytest.raises(ValueError, match="baseline looks at an image; an agent is shown det"):
+    with pytest.raises(ValueError, match="baseline needs an image; an agent is shown det"):
         agent.act(agent.start(), [Detection("sink", 0.1, 0.1, 0.3, 0.4)], "mug")
 
 
 def test_attention_sums_to_one_over_the_detections_and_none_is_fine(agent):
     seen = [Detection("coffee machine", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.5, 0.5, 1, 1)]
-    memory, decision = agent.act(agent.start(), seen, "toaster")
+    state, decision = agent.act(agent.start(), seen, "toaster")
     assert decision.attention.shape == (2,)
     assert decision.attention.sum() == pytest.approx(1, abs=1e-5)
-    _, blank = agent.act(memory, [], "toaster")
+    _, blank = agent.act(state, [], "toaster")
     assert blank.attention.shape == (0,)
     assert np.isfinite(blank.probabilities).all()
 
@@ -317,9 +350,9 @@ def test_a_run_of_the_first_version_still_decides_as_it_did(tmp_path):
     run = shutil.copytree(OLD_RUN, tmp_path / "run")
     old = tdanet_jax.load(run)
     seen = [Detection("sink", 0.1, 0.2, 0.4, 0.5), Detection("coffee machine", 0.5, 0.5, 0.75, 1.0)]
-    memory = old.start()
+    state = old.start()
     for _ in range(2):
-        memory, decision = old.act(memory, seen, "toaster")
+        state, decision = old.act(state, seen, "toaster")
     expected = json.loads((run / "second_decision.json").read_text())
     np.testing.assert_allclose(decision.probabilities, expected["probabilities"], atol=1e-6)
     np.testing.assert_allclose(decision.value, expected["value"], atol=1e-6)

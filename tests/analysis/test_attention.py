@@ -31,10 +31,10 @@ def test_means_are_those_of_a_plain_loop(some_rooms, player):
     target[300:] = target[:40]
     pairs = pairs_of(player, some_rooms, pose, target)
     task = player.task
-    _, looks = attention.look(
-        player.model, player.weights, task.words, task.eval_params, pose, target
+    _, frames = attention.attend(
+        player.model, player.weights, task.words, pose, target, task.eval_params
     )
-    weights = np.asarray(looks.attention, np.float64)
+    weights = np.asarray(frames.attention, np.float64)
     found: dict[tuple[int, int], list[tuple[float, float]]] = {}
     for i in range(len(pose)):
         rows = slice(some_rooms.row_start[pose[i]], some_rooms.row_start[pose[i] + 1])

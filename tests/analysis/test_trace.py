@@ -12,12 +12,13 @@ from flax import linen as nn
 
 from tdanet_jax.analysis import attention, episode_lookup, replay, trace
 from tdanet_jax.analysis.trace import Player
-from tdanet_jax.env import dynamics
-from tdanet_jax.env.dynamics import TEST_STEP_LIMITS
-from tdanet_jax.env.reward import Parents
+from tdanet_jax.env.params import TEST_STEP_LIMITS, make_params
+from tdanet_jax.env.reward import no_parents
 from tdanet_jax.evaluation import episodes, rollout
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.encoder import Encoder
+from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.scenes import camera_view
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.vocabulary import TARGETS, Action
 from tests.conftest import TINY, save_untrained
@@ -40,22 +41,23 @@ def one(chosen, i):
 
 
 @pytest.fixture(scope="module")
-def sensing_player(some_rooms, glove, tmp_path_factory):
-    """A player that senses its way and where its target is."""
+def triangulating_player(some_rooms, glove, tmp_path_factory):
+    """A player with odometry and triangulation."""
     network = dataclasses.replace(TINY.network, odometry=True, triangulation=True)
     config = dataclasses.replace(TINY, network=network)
-    folder = tmp_path_factory.mktemp("runs") / "sensing"
+    folder = tmp_path_factory.mktemp("runs") / "triangulating"
     save_untrained(config, folder, some_rooms, glove)
     return trace.load_player(folder, Rooms(some_rooms, None))
 
 
-@pytest.mark.parametrize("who", ["player", "sensing_player"])
+@pytest.mark.parametrize("who", ["player", "triangulating_player"])
 def test_sampled_episodes_come_from_the_probabilities_and_the_stream_of_the_evaluation(
     some_rooms, who, chosen, request
 ):
     """The batch's actions, drawn again from the traces' probabilities with the same keys."""
     player, key = request.getfixturevalue(who), jax.random.key(3)
-    assert player.model.odometry == player.model.triangulation == (who == "sensing_player")
+    sensors = () if who == "player" else ("odometry", "triangulation")
+    assert player.model.spec.sensors == sensors
     records = rollout.evaluate(player.policy, player.weights, player.task.eval_params, chosen, key)
     traces = [
         trace.retrace(player, some_rooms, one(chosen, i), records.actions[i, : records.length[i]])
@@ -99,7 +101,7 @@ def test_attention_and_difference_are_those_of_the_printed_equations(
     target = np.concatenate([equations.TARGET_BOX, words[some_rooms.classes.index(seen.target)]])
     compared = 0
     for step, pose in enumerate(seen.pose[:-1]):
-        view = trace.view(some_rooms, pose)
+        view = camera_view.of_pose(some_rooms, pose)
         assert seen.attention[step].shape == seen.correspondence[step].shape == (len(view.boxes),)
         if not len(view.boxes):
             continue
@@ -124,16 +126,13 @@ def test_attention_and_difference_are_those_of_the_printed_equations(
 
 def test_objects_of_a_class_share_the_weight_of_its_merged_row(some_rooms, player, chosen):
     task = player.task
-    nothing = Parents(
-        np.full((len(some_rooms.targets), 3), -1, np.int32),
-        np.zeros((len(some_rooms.targets), 3), np.float32),
-    )
-    merged = dynamics.make_params(some_rooms, TARGETS, nothing, TEST_STEP_LIMITS, merge=True)
+    spec = ObservationSpec("class")
+    merged = make_params(some_rooms, TARGETS, no_parents(some_rooms), TEST_STEP_LIMITS, spec)
     other = dataclasses.replace(player, task=dataclasses.replace(task, eval_params=merged))
     seen = trace.play(other, some_rooms, one(chosen, 1))
     several = 0
     for pose, weights in zip(seen.pose, seen.attention, strict=False):
-        names = np.array(trace.view(some_rooms, pose).classes)
+        names = np.array(camera_view.of_pose(some_rooms, pose).classes)
         total = 0.0
         for name in set(names):
             own = weights[names == name]
@@ -162,7 +161,7 @@ class Blind(Encoder):
         return words
 
     @nn.compact
-    def __call__(self, table, obs, action, keep=None):
+    def __call__(self, table, obs, action, dropout_mask=None):
         return self.param("scale", nn.initializers.ones, ()) * table[obs.target]
 
 
@@ -190,7 +189,7 @@ def test_what_has_no_box_is_not_in_view(some_rooms):
     boxes = some_rooms.row_box.copy()
     boxes[some_rooms.row_start[pose] + 2] = -1
     with_gap = dataclasses.replace(some_rooms, row_box=boxes)
-    whole, gap = trace.view(some_rooms, pose), trace.view(with_gap, pose)
+    whole, gap = camera_view.of_pose(some_rooms, pose), camera_view.of_pose(with_gap, pose)
     assert gap.classes == whole.classes[:2] + whole.classes[3:]
     np.testing.assert_array_equal(gap.boxes, np.delete(whole.boxes, 2, axis=0))
 
@@ -210,7 +209,7 @@ def test_a_recorded_episode_is_shown_as_it_happened(some_rooms, player, opiniona
 def test_frames_in_which_an_action_was_chosen(some_rooms, player, chosen):
     params = player.task.eval_params
     records = rollout.evaluate(player.policy, player.weights, params, chosen, jax.random.key(1))
-    pose, target = trace.visited(params, chosen, records)
+    pose, target = trace.visited(chosen, records, params)
     assert len(pose) == len(target) == records.length.sum()
     first = np.concatenate([[0], np.cumsum(records.length)[:-1]])
     np.testing.assert_array_equal(pose[first], chosen.pose)

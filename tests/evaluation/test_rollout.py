@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given, settings
 
 from tdanet_jax.env import dynamics
-from tdanet_jax.env.dynamics import TEST_STEP_LIMITS, EnvParams
-from tdanet_jax.env.reward import Parents
+from tdanet_jax.env.params import TEST_STEP_LIMITS, make_params
+from tdanet_jax.env.reward import no_parents
+from tdanet_jax.env.types import EnvParams, EnvState
 from tdanet_jax.evaluation import episodes, metrics, policies, rollout
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.policies import Policy
@@ -22,6 +23,7 @@ from tdanet_jax.evaluation.rollout import Records
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.tdanet import TDANetEncoder
+from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.splits import make_split
 from tdanet_jax.vocabulary import TARGETS, Action
@@ -35,9 +37,7 @@ KEY = jax.random.key(0)
 def params_of(
     tables: SceneTables, targets: Any = TARGETS, limits: Any = TEST_STEP_LIMITS
 ) -> EnvParams:
-    shape = (len(tables.targets), 3)
-    parents = Parents(np.full(shape, -1, np.int32), np.zeros(shape, np.float32))
-    return dynamics.make_params(tables, targets, parents, limits, merge=True)
+    return make_params(tables, targets, no_parents(tables), limits, ObservationSpec("class"))
 
 
 @pytest.fixture(scope="module")
@@ -139,9 +139,7 @@ def test_the_optimal_length_counts_done(rooms: SceneTables, params: EnvParams) -
 def test_who_says_done_too_late_is_stopped_by_the_limit_of_the_room(
     rooms: SceneTables, params: EnvParams
 ) -> None:
-    def act(
-        weights: Any, memory: Any, key: Any, state: dynamics.EnvState, params: EnvParams
-    ) -> Any:
+    def act(weights: Any, memory: Any, key: Any, state: EnvState, params: EnvParams) -> Any:
         # Done comes one action too late: where the target is in view, it must not count any more.
         limit = params.step_limit[params.position_room[state.pose // 16].astype(jnp.int32)]
         late = state.steps >= limit
@@ -195,17 +193,17 @@ def test_a_network_acts_as_a_plain_loop_over_its_own_past_does(
     assert len(np.unique(records.actions)) > 3
 
     @jax.jit
-    def think(state: dynamics.EnvState, carry: Any, previous: jax.Array, fresh: jax.Array) -> Any:
+    def think(state: EnvState, carry: Any, probs: jax.Array, is_first: jax.Array) -> Any:
         table = actor_critic.prepare(MODEL, weights, words)
         obs = jax.tree.map(lambda x: x[None], dynamics.observe(state, params))
-        return actor_critic.forward(MODEL, weights, table, carry, obs, previous, fresh)
+        return actor_critic.forward(MODEL, weights, table, carry, obs, probs, is_first)
 
     for i in range(0, len(chosen), 5):
-        state = dynamics.start(params, jnp.int32(chosen.pose[i]), jnp.int32(chosen.target[i]))
-        carry, previous = MODEL.initial_carry(1, weights), jnp.zeros((1, 6))
+        state = dynamics.start(jnp.int32(chosen.pose[i]), jnp.int32(chosen.target[i]), params)
+        carry, probs = MODEL.initial_carry(1, weights), jnp.zeros((1, 6))
         for t in range(min(int(records.length[i]), 12)):
-            carry, out = think(state, carry, previous, jnp.array([t == 0]))
-            previous = jax.nn.softmax(out.logits)
+            carry, out = think(state, carry, probs, jnp.array([t == 0]))
+            probs = jax.nn.softmax(out.logits)
             action = int(np.argmax(out.logits))
             assert action == records.actions[i, t]
             state = dynamics.transition(state, jnp.int32(action), params).state
@@ -233,7 +231,7 @@ def test_sampled_actions_follow_the_probabilities_of_the_network(
     many = Episodes(np.repeat(start.pose[:1], 4000), np.repeat(start.target[:1], 4000))
     records = rollout.evaluate(policies.network(MODEL, words), weights, params, many, KEY)
     table = actor_critic.prepare(MODEL, weights, words)
-    state = dynamics.start(params, jnp.asarray(start.pose[:1]), jnp.asarray(start.target[:1]))
+    state = dynamics.start(jnp.asarray(start.pose[:1]), jnp.asarray(start.target[:1]), params)
     obs = jax.vmap(dynamics.observe, (0, None))(state, params)
     blank = (MODEL.initial_carry(1, weights), obs, jnp.zeros((1, 6)), jnp.ones(1, bool))
     _, out = actor_critic.forward(MODEL, weights, table, *blank)
