@@ -3,8 +3,8 @@
     python -m experiments.attention --checkpoint runs/...
     python -m experiments.attention --checkpoint runs/... --scene FloorPlan228 --target Laptop
 
-The first plays the fixed test episodes and writes into --out the mean attention by class pair
-(class_pairs.csv, .md, .png) and a picture of one episode; the second draws the chosen episode.
+The first form plays the fixed test episodes, and writes to --out the mean attention by class pair
+(class_pairs.csv, .md, .png) and a picture of one episode. The second draws the chosen episode.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Command:
     """Folder of a run."""
     choice: tyro.conf.OmitArgPrefixes[Choice]
     out: Path | None = None
-    """Folder to write; by default <run>/attention-<policy>, for a point of the run's history
-    <run>/attention-<policy>-<updates>."""
+    """Folder to write; by default <run>/attention-<policy>, or <run>/attention-<policy>-<updates>
+    for a point of the run's history."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -81,14 +81,14 @@ def show(command: Command) -> None:
 
 
 def default_folder(command: Command) -> Path:
-    """Where to write if nothing is said: another folder for each network and policy."""
+    """The default of --out: one folder for each network and policy."""
     point = f"-{command.checkpoint.stem}" if command.checkpoint.suffix == ".npz" else ""
     name = f"attention-{command.choice.policy}{point}"
     return one_episode.folder_of(command.checkpoint) / name
 
 
 def play_lists(player: Player, tables: SceneTables, seed: int) -> Played:
-    """The player's records of the fixed test episodes."""
+    """Plays the fixed test episodes."""
     from tdanet_jax.evaluation import episodes, rollout
 
     lists = episodes.load(tables, player.task.split, player.task.extras)
@@ -129,7 +129,7 @@ def write_pairs(player: Player, tables: SceneTables, played: Played, out: Path) 
 
 
 def example(player: Player, tables: SceneTables, played: Played) -> Trace:
-    """An episode to show: the first success with L >= 5, unseen targets first; else the first."""
+    """The first success with L >= 5, unseen targets first; failing that, the first episode."""
     import numpy as np
 
     from tdanet_jax.analysis import trace

@@ -1,4 +1,4 @@
-"""What the commands that show one episode share: which episode, and who plays it."""
+"""Shared by the commands that show one episode: which episode, and the agents that play it."""
 
 from __future__ import annotations
 
@@ -26,33 +26,33 @@ class Choice:
     """Which episode to show."""
 
     scene: str | None = None
-    """Room, say FloorPlan228; with --target."""
+    """Room, such as FloorPlan228; requires --target."""
     target: str | None = None
-    """Target class, say Laptop; with --scene."""
+    """Target class, such as Laptop; requires --scene."""
     start: tuple[float, float, int] | None = None
-    """x and z in metres and rotation in degrees (a multiple of 45); the nearest reachable point is
-    taken, at most 0.5 m away. By default a start is drawn."""
+    """x and z in metres, rotation in degrees (a multiple of 45). The episode starts at the nearest
+    reachable point, at most 0.5 m away. By default, a start is drawn."""
     episode: int | None = None
-    """Instead of a room and a target: an episode of the first checkpoint's episodes.jsonl, counted
-    from 0, as it was recorded. Other checkpoints play it anew."""
+    """Instead of --scene and --target: an episode of the first checkpoint's episodes.jsonl, counted
+    from 0. It is shown as recorded; further checkpoints play it from the same start."""
     seed: int = 0
-    """Seed of the drawn start and of sampled actions."""
+    """Seed for drawing the start and sampling actions."""
     data: str | None = None
-    """File of rooms that `experiments.scenes import` wrote, in place of those of the first run."""
+    """File of rooms that `experiments.scenes import` wrote; by default, the first run's rooms."""
     policy: Literal["sample", "greedy"] = "sample"
-    """How actions are chosen."""
+    """Whether actions are sampled or the most probable ones are taken."""
 
     @property
     def given(self) -> bool:
-        """Whether an episode was chosen at all."""
+        """Whether any flag chooses an episode."""
         return any(flag is not None for flag in (self.scene, self.target, self.start, self.episode))
 
 
 def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
-    """Ends the program, before anything is computed, if the flags do not choose one episode.
+    """Ends the program, before anything is computed, unless the flags choose one episode.
 
     Args:
-      required: whether choosing none is wrong, too.
+      required: whether an episode must be chosen.
     """
     if not runs:
         fail("give --checkpoint, the folder of a run")
@@ -73,12 +73,12 @@ def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
 
 
 def folder_of(run: Path) -> Path:
-    """The folder of a run, also of a point of its history (`history/<updates>.npz`)."""
+    """The folder of a run, or of the run of a point of history (`history/<updates>.npz`)."""
     return run.parent.parent if run.suffix == ".npz" else run
 
 
 def load_rooms(choice: Choice, runs: Sequence[Path]) -> Rooms:
-    """The rooms of `--data`, else those of the first run, with progress if they are rebuilt."""
+    """The rooms of --data or of the first run; shows progress if they are rebuilt."""
     from tdanet_jax.scenes import dataset
 
     data = choice.data
@@ -89,7 +89,7 @@ def load_rooms(choice: Choice, runs: Sequence[Path]) -> Rooms:
 
 
 def load_players(runs: Sequence[Path], rooms: Rooms, policy: str) -> list[Player]:
-    """The agents of some runs, each with a name of its own."""
+    """The agents of some runs, by different names."""
     from tdanet_jax.analysis import trace
 
     players = [trace.load_player(run, rooms, policy == "greedy") for run in runs]
@@ -104,7 +104,7 @@ Chosen = tuple["Episodes", "np.ndarray | None"]
 
 
 def choose(choice: Choice, runs: Sequence[Path], tables: SceneTables) -> Chosen:
-    """The episode that the flags mean, and the actions of runs[0] if it is a recorded one."""
+    """The episode that the flags choose, and the actions of runs[0] if it was recorded."""
     from tdanet_jax.analysis import episode_lookup
 
     if choice.episode is not None:
@@ -127,7 +127,7 @@ def play(chosen: Chosen, players: Sequence[Player], tables: SceneTables, seed: i
 
 
 def play_runs(choice: Choice, runs: Sequence[Path], rooms: Rooms, shortest: bool) -> list[Trace]:
-    """The chosen episode, played by the agents of some runs and, if asked for, on the best way."""
+    """The chosen episode, played by the agents of some runs; `shortest` adds the shortest path."""
     from tdanet_jax.analysis import trace
 
     chosen = choose(choice, runs, rooms.tables)
@@ -137,8 +137,8 @@ def play_runs(choice: Choice, runs: Sequence[Path], rooms: Rooms, shortest: bool
     return play(chosen, players, rooms.tables, choice.seed)
 
 
-def tell(traces: Sequence[Trace], out: Path) -> None:
-    """Prints how it went, and what was written."""
+def print_outcomes(traces: Sequence[Trace], out: Path) -> None:
+    """Prints the outcome of each trace, and the file that was written."""
     first = traces[0]
     console.print(f"{first.target} in {first.scene}")
     for trace in traces:

@@ -1,9 +1,9 @@
-"""Writes an episode as one HTML page that needs nothing beside itself.
+"""Writes an episode as one self-contained HTML page.
 
     python -m experiments.replay --checkpoint runs/... --scene FloorPlan228 --target Laptop
 
-Floor plan and path, what the agent sees and attends to, action probabilities and value, step by
-step; several checkpoints side by side.
+The page shows, step by step, the path on the floor plan, what the agent sees and attends to, its
+action probabilities and its value; several agents side by side.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from experiments.one_episode import Choice
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Writes an episode as one HTML page that needs nothing beside itself."""
+    """Writes an episode as one self-contained HTML page."""
 
     checkpoint: tyro.conf.UseAppendAction[tuple[Path, ...]]
-    """Folder of a run; repeat the flag to see several side by side."""
+    """Folder of a run; repeat the flag to compare several."""
     choice: tyro.conf.OmitArgPrefixes[Choice]
     shortest: bool = False
     """Also show the shortest path."""
@@ -52,7 +52,7 @@ def write(command: Command) -> None:
     page = replay.page(traces, rooms.tables)
     command.out.parent.mkdir(parents=True, exist_ok=True)
     files.write_text(command.out, page)
-    one_episode.tell(traces, command.out)
+    one_episode.print_outcomes(traces, command.out)
 
 
 if __name__ == "__main__":

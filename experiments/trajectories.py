@@ -58,7 +58,7 @@ def write(command: Command) -> None:
     command.out.parent.mkdir(parents=True, exist_ok=True)
     draw = pictures.animation if animated else pictures.trajectories
     draw(traces, plan, rooms.tables, command.out)
-    one_episode.tell(traces, command.out)
+    one_episode.print_outcomes(traces, command.out)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""A trained agent in AI2-THOR itself, for those who have Unity (`pip install ai2thor`).
+"""Runs a trained agent in AI2-THOR itself (requires Unity and `pip install ai2thor`).
 
 controller = Controller(scene="FloorPlan228", **SETTINGS)  # from ai2thor.controller
 episode = play(controller, tdanet_jax.load("runs/my-run"), "Laptop")
 
-The controller is an argument: this module needs neither Unity nor the `ai2thor` package. What it
-relies on, and what of it was never tried: docs/analysis.md.
+The controller is an argument: this module itself needs neither Unity nor the `ai2thor` package.
+docs/analysis.md lists what it relies on, and what was never tested with Unity.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tdanet_jax.vocabulary import (
     class_words,
 )
 
-#: Arguments of AI2-THOR's `Controller` that fit the rooms in which agents are trained.
+#: Arguments of AI2-THOR's `Controller` that match the rooms in which agents are trained.
 SETTINGS: dict[str, Any] = {
     "width": IMAGE_SIZE,
     "height": IMAGE_SIZE,
@@ -34,19 +34,19 @@ SETTINGS: dict[str, Any] = {
     "visibilityDistance": VISIBILITY_DISTANCE,
     "gridSize": GRID_SIZE,
     "rotateStepDegrees": 360 // ROTATIONS,
-    "snapToGrid": False,  # AI2-THOR refuses to snap beside turns of 45 degrees
+    "snapToGrid": False,  # AI2-THOR refuses to combine it with turns of 45 degrees
     "renderInstanceSegmentation": True,
 }
 
-#: Object types that are parts of the building: the rooms in which agents are trained hold none.
+#: Object types that are parts of the building; the rooms in which agents are trained have none.
 STRUCTURE = frozenset({IGNORED, "Ceiling", "Door", "Doorframe", "Doorway", "Room", "Wall"})
 
-#: Metres and degrees by which AI2-THOR may miss the pose that the actions lead to.
+#: Metres and degrees by which AI2-THOR's pose may differ from the expected one.
 NEAR, ALIGNED = 0.05, 1.0
 
 
 class Event(Protocol):
-    """What is read of AI2-THOR's `Event`: a frame behind an action."""
+    """The used part of AI2-THOR's `Event`: the frame after an action."""
 
     metadata: Any  # agent, objects, lastActionSuccess, errorMessage
     instance_detections2D: Any  # object's id -> x1, y1, x2, y2: first and last pixel, y down
@@ -55,16 +55,16 @@ class Event(Protocol):
 
 
 class Controller(Protocol):
-    """What is used of AI2-THOR's `Controller`."""
+    """The used part of AI2-THOR's `Controller`."""
 
     last_event: Any
 
     def step(self, action: str, **arguments: Any) -> Any:
-        """Takes an action and returns its `Event`."""
+        """Executes an action and returns its `Event`."""
 
 
 class Place(NamedTuple):
-    """Where AI2-THOR's agent is."""
+    """The pose of AI2-THOR's agent."""
 
     x: float  # metres
     z: float  # metres
@@ -72,7 +72,7 @@ class Place(NamedTuple):
     horizon: float  # degrees down
 
     def __str__(self) -> str:
-        """As errors say it."""
+        """As in error messages."""
         x, z, rotation, horizon = (round(value, 2) for value in self)
         return f"x {x:g}, z {z:g}, rotation {rotation:g}, horizon {horizon:g}"
 
@@ -82,8 +82,8 @@ class Episode(NamedTuple):
 
     decisions: tuple[Decision, ...]  # T
     places: tuple[Place, ...]  # T + 1, before each action and at the end
-    success: bool  # Done while AI2-THOR calls an object of the target's type visible
-    unnamed: frozenset[str]  # object types in view that have no word vector, and were left out
+    success: bool  # Done while an object of the target's type is `visible` in AI2-THOR
+    unnamed: frozenset[str]  # object types in view that were left out: they have no word vector
 
     @property
     def actions(self) -> tuple[Action, ...]:
@@ -94,10 +94,10 @@ class Episode(NamedTuple):
 def detections(event: Event) -> list[Detection]:
     """The objects in view, labelled by their type, without parts of the building.
 
-    A segment that is none of the metadata's objects (a wall, the ceiling) is no detection.
+    Segments that are not among the metadata's objects (walls, the ceiling) are left out.
 
     Raises:
-      ValueError: the frame has no detections, as its controller was not asked for them.
+      ValueError: the frame has no detections, since its controller was made without them.
     """
     boxes = getattr(event, "instance_detections2D", None)
     if boxes is None:
@@ -108,7 +108,7 @@ def detections(event: Event) -> list[Detection]:
     kinds = {item["objectId"]: item["objectType"] for item in event.metadata["objects"]}
     wide, high = event.screen_width, event.screen_height
     return [
-        # The last pixel is inside the box: its far side is one further.
+        # The last pixel belongs to the box, so its far side is one pixel further.
         Detection(kinds[name], x1 / wide, y1 / high, (x2 + 1) / wide, (y2 + 1) / high)
         for name, (x1, y1, x2, y2) in boxes.items()
         if name in kinds and kinds[name] not in STRUCTURE
@@ -116,7 +116,7 @@ def detections(event: Event) -> list[Detection]:
 
 
 def is_visible(event: Event, target: str) -> bool:
-    """Whether AI2-THOR calls an object of this type visible: in view and within 1.5 m."""
+    """Whether an object of this type is `visible` in AI2-THOR: in view and within 1.5 m."""
     words = class_words(target)
     return any(
         item["visible"] and class_words(item["objectType"]) == words
@@ -131,37 +131,37 @@ def play(
     key: jax.Array | None = None,
     step_limit: int = 100,
 ) -> Episode:
-    """One episode, from where AI2-THOR's agent is now.
+    """Plays one episode from the present pose of AI2-THOR's agent.
 
-    Actions do what they do in the environment. MoveAhead along a diagonal goes one cell along both
-    axes. A look beyond level and 30 degrees down, which AI2-THOR would allow, is not passed on, and
-    neither is Done: it ends the episode, which is judged by the last frame.
+    Actions have the same effects as in the environment: MoveAhead along a diagonal moves one cell
+    along both axes, and the camera stays between level and 30 degrees down. Done is not sent to
+    AI2-THOR; it ends the episode, and success is judged by the last frame.
 
     Args:
       controller: made with `SETTINGS`, its agent on the grid, at a multiple of 45 degrees.
-      target: what to look for, in English; an object type such as "Laptop" if success matters.
+      target: what to look for, in English; for `success`, an object type such as "Laptop".
       key: samples the actions, as in training; None takes the most probable ones.
       step_limit: actions after which the episode ends without success. Test episodes have 100, and
         200 in living rooms.
 
     Raises:
       KeyError: the target has a word without a word vector.
-      ValueError: the start is at no multiple of 45 degrees or looks neither level nor 30 degrees
-        down; frames have no detections; an action did not lead where it should, as with other
-        settings; or the agent looks at an image.
+      ValueError: the start's rotation is not a multiple of 45 degrees, or its horizon neither 0 nor
+        30 degrees; a frame has no detections; an action led to an unexpected pose, as with other
+        settings; or the agent requires an image.
     """
     if step_limit < 1:
         raise ValueError(f"step_limit {step_limit}: must be at least 1")
     event = controller.last_event
     places, decisions, unnamed = [_place(event)], [], set[str]()
-    memory = agent.start(places[0].rotation, places[0].horizon)
+    state = agent.start(places[0].rotation, places[0].horizon)
     expected, blocked = _on_the_grid(places[0]), False
     for step in range(step_limit):
         seen = detections(event)
         named = [found for found in seen if agent.knows(found.label)]
         unnamed |= {found.label for found in seen} - {found.label for found in named}
         now = None if key is None else jax.random.fold_in(key, step)
-        memory, decision = agent.act(memory, named, target, now, blocked)
+        state, decision = agent.act(state, named, target, now, blocked)
         decisions.append(decision)
         event, expected, blocked = _take(controller, event, expected, decision.action)
         places.append(_place(event))
@@ -178,24 +178,21 @@ def _place(event: Event) -> Place:
 
 
 def _on_the_grid(place: Place) -> Place:
-    """With the angles that it means."""
-    rotation, horizon = (
-        45 * (round(place.rotation / 45) % ROTATIONS),
-        30 * round(place.horizon / 30),
-    )
-    return place._replace(rotation=rotation, horizon=horizon)
+    """The place, its angles rounded to multiples of 45 and 30 degrees."""
+    rotation = 45 * (round(place.rotation / 45) % ROTATIONS)
+    return place._replace(rotation=rotation, horizon=30 * round(place.horizon / 30))
 
 
 def _take(
     controller: Controller, event: Event, before: Place, action: Action
 ) -> tuple[Event, Place, bool]:
-    """The frame behind an action, where the agent should be, and whether it was blocked.
+    """The frame after an action, the expected place, and whether the agent was blocked.
 
     Args:
-      before: where the agent should be before it; what AI2-THOR misses does not add up.
+      before: the expected place before the action, so that deviations do not add up.
 
     Raises:
-      ValueError: AI2-THOR's agent is not where the actions so far lead.
+      ValueError: AI2-THOR's agent is not at the expected place.
     """
     heading, down = round(before.rotation / 45), round(before.horizon / 30)
     right = (action == Action.ROTATE_RIGHT) - (action == Action.ROTATE_LEFT)

@@ -1,4 +1,4 @@
-"""One episode by name: in a room with a target and a start, or one that a run has recorded."""
+"""Looks up one episode: by room, target and start, or in the records of a run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FARTHEST_START = 0.5
 
 
 class Start(NamedTuple):
-    """Where an episode starts; the nearest reachable point is taken, at most 0.5 m away."""
+    """Where an episode starts: at the nearest reachable point, at most 0.5 m away."""
 
     x: float  # metres
     z: float  # metres
@@ -45,12 +45,12 @@ def find(
     """One episode in a room.
 
     Args:
-      start: by default one is drawn, as those of tests are.
-      seed: of the drawn start.
+      start: by default one is drawn, as for test episodes.
+      seed: for drawing the start.
 
     Raises:
-      ValueError: no such room, target or heading, no reachable point near the start, or the target
-        is out of reach; the message says what there is.
+      ValueError: there is no such room, target or heading, no reachable point near the start, or
+        the target is out of reach; the message lists what there is.
     """
     if scene not in tables.scenes:
         raise ValueError(f"{scene}: no such room; there are {name_ranges(tables.scenes)}")
@@ -67,7 +67,7 @@ def find(
     pose, goal = tables.nearest_state(index, *start), tables.targets.index(target)
     x, _, z = tables.position[poses.split(pose).position]
     away = math.hypot(x - start.x, z - start.z)
-    if not away <= FARTHEST_START:  # nor where it is no number
+    if not away <= FARTHEST_START:  # so that NaN is refused, too
         raise ValueError(
             f"start at x {start.x:g}, z {start.z:g}: {away:.2f} m from the nearest place to stand "
             f"in {scene}, x {x:g}, z {z:g}; at most {FARTHEST_START} m"
@@ -78,10 +78,10 @@ def find(
 
 
 def name_ranges(names: Sequence[str]) -> str:
-    """Names in short: "FloorPlan1-30, FloorPlan201-230"."""
+    """Names with runs of numbers abbreviated: "FloorPlan1-30, FloorPlan201-230"."""
     stems = [re.sub(r"\d+$", "", name) for name in names]
     numbers = [int(name[len(stem) :] or -1) for name, stem in zip(names, stems, strict=True)]
-    # Within a run of numbers, number minus place stays the same.
+    # Within a run of numbers, number minus index is constant.
     runs = itertools.groupby(range(len(names)), key=lambda i: (stems[i], numbers[i] - i))
     parts = []
     for _, members in runs:

@@ -1,4 +1,4 @@
-"""An episode to look at: one HTML page that needs nothing beside itself."""
+"""Replays of an episode: one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
 
 TEMPLATE = "replay.html"
-#: The place in the template that the episode goes to.
+#: Where the template takes the episode.
 SLOT = "{{EPISODE}}"
-#: Units of the page's drawings: of the camera's image, and of a metre on the plan.
+#: Units of the page's drawings: the width of the camera's view, and a metre on the plan.
 IMAGE, METRE = 300, 100
-#: Scale of a plan's font where several players leave it less room.
+#: Scale of a plan's font if there are several players, whose plans are smaller.
 SMALL_PLAN = 1.3
 
 
@@ -53,7 +53,7 @@ def page(traces: Sequence[Trace], tables: SceneTables) -> str:
 
 
 def embed(value: Any) -> str:
-    """JSON that can stand inside a `script` element whatever its strings hold."""
+    """JSON that is safe inside a `script` element, whatever its strings contain."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     for sign in "<>&":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
@@ -90,7 +90,7 @@ def _player(trace: Trace, tables: SceneTables) -> dict[str, Any]:
 
 
 def _step(trace: Trace, tables: SceneTables, i: int) -> dict[str, Any]:
-    """What the page shows before action i, or at the end, where nothing is decided any more."""
+    """What the page shows before action i, or at the end, where there is no decision."""
     pose, last = int(trace.pose[i]), i == len(trace.actions)
     parts = poses.split(pose)
     x, _, z = tables.position[parts.position]

@@ -196,11 +196,11 @@ class Script:
     def knows(self, label):
         return label.isalpha()
 
-    def act(self, memory, detections, target, key=None, blocked=None):
+    def act(self, state, detections, target, key=None, blocked=None):
         self.seen.append(detections)
         self.blocked.append(blocked)
         self.keys.append(key)
-        return memory, Decision(self.actions[len(self.seen) - 1], np.full(6, 1 / 6), 0.0, None)
+        return state, Decision(self.actions[len(self.seen) - 1], np.full(6, 1 / 6), 0.0, None)
 
 
 def where(rooms, rotation, free):

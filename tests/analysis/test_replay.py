@@ -141,7 +141,7 @@ def test_each_step_shows_its_boxes_shades_and_probabilities(visit, traces, some_
     page = visit(replay.page(traces, some_rooms))
     network = page.locator(".player").first
     assert page.locator(".player").count() == 2
-    assert "No attention to show" in page.locator(".player").nth(1).inner_text()
+    assert "This agent has no attention" in page.locator(".player").nth(1).inner_text()
     for step in range(min(len(traces[0].actions), 12)):
         weights = traces[0].attention[step]
         shown = network.locator("svg.view rect").evaluate_all(
