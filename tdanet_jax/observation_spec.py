@@ -26,6 +26,11 @@ class ObservationSpec:
     image: Literal["raster", "features"] | None = None
     sensors: tuple[str, ...] = ()
 
+    def agent_name(self, model: str) -> str:
+        """A model's name, and its sensors, which the paper's agents lack: tdanet, --odometry."""
+        flags = (f"--{name}" if name in SENSORS else f"--sensors {name}" for name in self.sensors)
+        return ", ".join([model, *flags])
+
     def check(self, model: str | None = None) -> None:
         """Raises ValueError, with one line that names the flag, if the parts do not go together.
 

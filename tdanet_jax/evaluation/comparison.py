@@ -24,7 +24,7 @@ Result = Mapping[str, Any]
 Columns = Mapping[str, Mapping[str, np.ndarray]]
 MEASURES = ("SR", "SPL")
 #: Flags that let an agent sense what the paper's do not.
-BEYOND = ("--odometry", "--triangulation")
+BEYOND = ("--odometry", "--triangulation", "--sensors")
 #: Flags that make no other agent: the seed, which distinguishes repetitions, and what only says
 #: how often something is looked at or kept.
 NOT_SETTINGS = ("--seed", "--chunk-updates", "--checkpoint-minutes", "--history", "--max-skipped")
@@ -50,7 +50,8 @@ def _flags(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
         if isinstance(value, Mapping):
             yield from _flags(value)
         else:
-            yield f"--{name.replace('_', '-')}", value
+            shown = " ".join(value) or None if isinstance(value, list | tuple) else value
+            yield f"--{name.replace('_', '-')}", shown
 
 
 def settings(config: TrainConfig) -> dict[str, Any]:

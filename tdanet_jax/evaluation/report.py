@@ -14,13 +14,17 @@ import numpy as np
 
 import tdanet_jax
 from tdanet_jax import poses
+from tdanet_jax.config import TrainConfig
 from tdanet_jax.evaluation import paper
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.metrics import BUCKETS, grouped, shown, summarise
 from tdanet_jax.evaluation.rollout import Records
 from tdanet_jax.io import files
+from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.registry import SENSORS
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.splits import GROUPS
+from tdanet_jax.task import Task
 from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS, ROOM_TYPES
 
 RESULTS_VERSION = 1
@@ -48,13 +52,12 @@ class Provenance:
       split, model: what was trained.
       policy: how actions were chosen.
       episodes_trained, steps: training episodes and environment steps.
-      seed: of the training; of policies without training, that of the evaluation.
-      evaluation_seed: with which actions were sampled in the test episodes.
-      data_version: of the scene tables that it was evaluated on.
-      data: file of their rooms, where they are not the bundled ones.
-      image: what the model sees, if it looks at an image.
-      odometry: whether it senses its own way, which the paper's agents do not.
-      triangulation: whether it senses its target's place, which they do not, either.
+      seed: of the training; for policies without training, of the evaluation.
+      evaluation_seed: of the actions sampled in the test episodes.
+      data_version: of the scene tables in the evaluation.
+      data: file of their rooms, unless they are the bundled ones.
+      image: the image that the model is shown, if there is one.
+      sensors: what the agent senses, which the paper's agents do not.
     """
 
     split: str
@@ -67,14 +70,38 @@ class Provenance:
     data_version: str
     data: str | None = None
     image: str | None = None
-    odometry: bool = False
-    triangulation: bool = False
+    sensors: tuple[str, ...] = ()
 
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        config: TrainConfig,
+        policy: str,
+        evaluation_seed: int,
+        episodes: int = 0,
+        updates: int = 0,
+    ) -> Provenance:
+        """That of a network with its actions "sample" or "greedy", or of a policy without one.
 
-def agent_name(model: str, odometry: bool, triangulation: bool) -> str:
-    """A model's name, and what it senses that the paper's agents do not."""
-    senses = {"--odometry": odometry, "--triangulation": triangulation}
-    return ", ".join([model, *(flag for flag, on in senses.items() if on)])
+        Args:
+          config: the network's run, with the rooms of the evaluation.
+          episodes, updates: how long the network was trained.
+        """
+        network = policy in ("sample", "greedy")
+        return cls(
+            split=task.split.name,
+            model=config.model if network else policy,
+            policy=policy,
+            episodes_trained=episodes,
+            seed=config.seed if network else evaluation_seed,
+            evaluation_seed=evaluation_seed,
+            steps=updates * config.steps_per_update,
+            data_version=task.tables.data_version,
+            data=config.data,
+            image=task.image if network else None,
+            sensors=task.spec.sensors if network else (),
+        )
 
 
 def columns(tables: SceneTables, episodes: Episodes, records: Records) -> dict[str, np.ndarray]:
@@ -109,6 +136,8 @@ def results(provenance: Provenance, groups: Mapping[str, Mapping[str, np.ndarray
         }
 
     origin = dataclasses.asdict(provenance)
+    origin |= {name: name in provenance.sensors for name in SENSORS}
+    origin["sensors"] = list(provenance.sensors)
     return {
         "version": RESULTS_VERSION,
         **{name: origin.pop(name) for name in _HEAD},
@@ -197,7 +226,7 @@ def all_rows(
 
 def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarray]]) -> str:
     """`results.md`: the tables of the paper's form, with the paper's rows beside ours."""
-    agent = agent_name(out["model"], out["odometry"], out["triangulation"])
+    agent = ObservationSpec(sensors=tuple(out["sensors"])).agent_name(out["model"])
     lines = [
         f"# {agent}, split {out['split']}, seed {out['seed']}",
         "",

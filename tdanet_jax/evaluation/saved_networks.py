@@ -24,7 +24,7 @@ from tdanet_jax.models import classes
 from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
 from tdanet_jax.task import Task, load_task
 from tdanet_jax.training import history
-from tdanet_jax.training.checkpoint import Checkpoints, is_passed_on, newest
+from tdanet_jax.training.checkpoint import Checkpoints, is_shared, newest
 from tdanet_jax.training.history import Snapshot
 
 #: Networks in one call; bounds the memory that a long list takes.
@@ -34,7 +34,7 @@ Played = Mapping[str, tuple[Episodes, Records]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Saved:
+class SavedNetwork:
     """A network on disk.
 
     Attributes:
@@ -71,7 +71,7 @@ class Evaluated:
       played: its episodes by group.
     """
 
-    saved: Saved
+    saved: SavedNetwork
     snapshot: Snapshot
     task: Task
     provenance: report.Provenance
@@ -96,7 +96,7 @@ class Evaluated:
         return {name: report.columns(self.task.tables, *pair) for name, pair in self.played.items()}
 
 
-def find(run: Path, with_history: bool = False, data: str | None = None) -> list[Saved]:
+def find(run: Path, with_history: bool = False, data: str | None = None) -> list[SavedNetwork]:
     """The newest network of a run, or its whole history, oldest first.
 
     Args:
@@ -110,10 +110,10 @@ def find(run: Path, with_history: bool = False, data: str | None = None) -> list
         points: list[Path | None] = [*history.points(run)]
         if not points:
             raise ValueError(f"{run / history.FOLDER}: no history; train with --history above 0")
-        return [Saved(run, config, point, data) for point in points]
-    if not is_passed_on(run) and Checkpoints(run).latest() is None:
+        return [SavedNetwork(run, config, point, data) for point in points]
+    if not is_shared(run) and Checkpoints(run).latest() is None:
         raise ValueError(f"{run}: no checkpoint")
-    return [Saved(run, config, None, data)]
+    return [SavedNetwork(run, config, None, data)]
 
 
 def share(run: Path, out: Path) -> None:
@@ -136,7 +136,7 @@ def share(run: Path, out: Path) -> None:
 
 
 def evaluate(
-    networks: Sequence[Saved], greedy: bool, seed: int | None = None
+    networks: Sequence[SavedNetwork], greedy: bool, seed: int | None = None
 ) -> Iterator[Evaluated]:
     """Plays the fixed test episodes with every network; those of one task come together.
 
@@ -146,7 +146,7 @@ def evaluate(
     Raises:
       ValueError: a network cannot be read, or was trained on other scene tables.
     """
-    groups: dict[TrainConfig, list[Saved]] = {}
+    groups: dict[TrainConfig, list[SavedNetwork]] = {}
     for network in networks:
         groups.setdefault(_task_config(network), []).append(network)
     for config, members in groups.items():
@@ -170,12 +170,19 @@ def evaluate(
                     saved=network,
                     snapshot=dataclasses.replace(snapshot, weights=None),
                     task=task,
-                    provenance=_provenance(network, snapshot, task, greedy, drawn),
+                    provenance=report.Provenance.of(
+                        task,
+                        dataclasses.replace(network.config, data=network.rooms),
+                        "greedy" if greedy else "sample",
+                        drawn,
+                        snapshot.episodes,
+                        snapshot.updates,
+                    ),
                     played=own,
                 )
 
 
-def _task_config(network: Saved) -> TrainConfig:
+def _task_config(network: SavedNetwork) -> TrainConfig:
     """Its configuration in the rooms to evaluate in, all that only training uses at its default."""
     default = TrainConfig()
     names = (
@@ -186,7 +193,7 @@ def _task_config(network: Saved) -> TrainConfig:
     return dataclasses.replace(network.config, data=network.rooms, **unused)
 
 
-def _checked(network: Saved, task: Task) -> Snapshot:
+def _checked(network: SavedNetwork, task: Task) -> Snapshot:
     snapshot = network.load()
     if network.data is None and snapshot.data_version != task.tables.data_version:
         raise ValueError(
@@ -195,22 +202,3 @@ def _checked(network: Saved, task: Task) -> Snapshot:
         )
     task.check_known(network.run, classes.load_vocabulary(network.run).names)
     return snapshot
-
-
-def _provenance(
-    network: Saved, snapshot: Snapshot, task: Task, greedy: bool, seed: int
-) -> report.Provenance:
-    return report.Provenance(
-        split=task.split.name,
-        model=network.config.model,
-        policy="greedy" if greedy else "sample",
-        episodes_trained=snapshot.episodes,
-        seed=network.config.seed,
-        evaluation_seed=seed,
-        steps=snapshot.updates * network.config.steps_per_update,
-        data_version=task.tables.data_version,
-        data=network.rooms,
-        image=task.image,
-        odometry="odometry" in task.spec.sensors,
-        triangulation="triangulation" in task.spec.sensors,
-    )

@@ -74,7 +74,7 @@ def progress(folder: Path, config: TrainConfig) -> Literal["new", "begun", "fini
 
 
 @dataclasses.dataclass(frozen=True)
-class Finished:
+class FinishedRun:
     """A finished run.
 
     Attributes:
@@ -90,14 +90,14 @@ class Finished:
     seconds: float | None
 
 
-def finished(folder: Path) -> Finished:
+def finished(folder: Path) -> FinishedRun:
     """A finished run.
 
     Raises:
       ValueError: the folder holds none; the message names it.
     """
     from tdanet_jax.evaluation.report import RESULTS_FILE
-    from tdanet_jax.training.run import METRICS_FILE, read_metrics
+    from tdanet_jax.training.journal import METRICS_FILE, read_metrics
 
     config = configs.load(folder / CONFIG_FILE)
     path = folder / RESULTS_FILE
@@ -110,7 +110,7 @@ def finished(folder: Path) -> Finished:
         raise ValueError(f"{path}: not the results of a run ({error})") from None
     rows = read_metrics(folder) if (folder / METRICS_FILE).exists() else []
     results["settings"] = comparison.settings(config)
-    return Finished(folder, config, results, rows[-1]["seconds"] if rows else None)
+    return FinishedRun(folder, config, results, rows[-1]["seconds"] if rows else None)
 
 
 #: What a report reads in a `results.json`, beside the rates of groups.
@@ -119,7 +119,7 @@ _READ = (
 )  # fmt: skip
 
 
-def find(out: Path) -> list[Finished]:
+def find(out: Path) -> list[FinishedRun]:
     """The finished runs in a sweep's folder, by name."""
     return [finished(path) for path in _with_results(out) if (path / CONFIG_FILE).exists()]
 
@@ -135,12 +135,12 @@ def _with_results(out: Path) -> list[Path]:
     return [path.parent for path in sorted(out.glob(f"*/{RESULTS_FILE}"))]
 
 
-def labels(runs: Sequence[Finished]) -> list[str]:
+def labels(runs: Sequence[FinishedRun]) -> list[str]:
     """What the report calls each run: those that differ in the seed alone share a name."""
     return comparison.labels([run.results for run in runs], [run.folder.name for run in runs])
 
 
-def histories(runs: Sequence[Finished], out: Path) -> Iterator[tuple[Finished, int]]:
+def histories(runs: Sequence[FinishedRun], out: Path) -> Iterator[tuple[FinishedRun, int]]:
     """Evaluates the histories that are not evaluated yet, into `out`/histories/<run>.json.
 
     Actions are sampled with each run's own seed: the end of its budget gives its results again.
@@ -169,7 +169,7 @@ def histories(runs: Sequence[Finished], out: Path) -> Iterator[tuple[Finished, i
         yield run, len(done[folder])
 
 
-def evaluated_history(run: Finished, out: Path) -> list[Result] | None:
+def evaluated_history(run: FinishedRun, out: Path) -> list[Result] | None:
     """The results of a run's history, or None if it is not evaluated as it is now."""
     path = out / HISTORIES / f"{run.folder.name}.json"
     if not path.exists():
@@ -182,7 +182,7 @@ def evaluated_history(run: Finished, out: Path) -> list[Result] | None:
     return results if of == _fingerprint(run) else None
 
 
-def _fingerprint(run: Finished) -> str:
+def _fingerprint(run: FinishedRun) -> str:
     """Another one for another configuration, other rooms or other networks in its history."""
     from tdanet_jax.training import history
 
@@ -191,7 +191,7 @@ def _fingerprint(run: Finished) -> str:
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 
 
-def untrained(runs: Sequence[Finished], seed: int) -> list[Result]:
+def untrained(runs: Sequence[FinishedRun], seed: int) -> list[Result]:
     """Results of random actions and of the shortest path on the splits of the runs."""
     from tdanet_jax.evaluation import episodes, policies, report, rollout
     from tdanet_jax.task import load_task
@@ -202,11 +202,7 @@ def untrained(runs: Sequence[Finished], seed: int) -> list[Result]:
         lists = episodes.load(task.tables, task.split, task.extras)
         for name, make in (("random", policies.random), ("shortest_path", policies.shortest_path)):
             played = rollout.evaluate_lists(make(), None, task.eval_params, lists, seed)
-            provenance = report.Provenance(
-                split=task.split.name, model=name, policy=name, episodes_trained=0, seed=seed,
-                evaluation_seed=seed, steps=0, data_version=task.tables.data_version,
-                data=config.data,
-            )  # fmt: skip
+            provenance = report.Provenance.of(task, config, name, seed)
             groups = {group: report.columns(task.tables, *pair) for group, pair in played.items()}
             out.append(report.results(provenance, groups))
     return out

@@ -9,7 +9,7 @@ from typing import Any
 
 from tdanet_jax.evaluation import comparison, paper
 from tdanet_jax.evaluation.comparison import Curve, Result, Spread
-from tdanet_jax.evaluation.sweep import Finished, evaluated_history, labels
+from tdanet_jax.evaluation.sweep import FinishedRun, evaluated_history, labels
 from tdanet_jax.registry import MODELS
 from tdanet_jax.splits import UNSEEN
 
@@ -46,7 +46,7 @@ class Report:
       code: the version of the code.
     """
 
-    runs: Sequence[Finished]
+    runs: Sequence[FinishedRun]
     untrained: Sequence[Result]
     costs: Mapping[str, Cost]
     curves: Mapping[str, Sequence[Curve]]
@@ -76,7 +76,7 @@ def _place(model: str) -> tuple[int, str]:
     return (order.index(model) if model in order else len(order), model)
 
 
-def make_curves(runs: Sequence[Finished], out: Path) -> dict[str, list[Curve]]:
+def make_curves(runs: Sequence[FinishedRun], out: Path) -> dict[str, list[Curve]]:
     """Learning curves by split, one a label, from the evaluated histories."""
     found: dict[str, dict[str, list[list[Result]]]] = {}
     named = zip(labels(runs), runs, strict=True)

@@ -88,6 +88,19 @@ def _is_running(process: int) -> bool:
     return True
 
 
+def check_empty(folder: Path, instead: str = "") -> None:
+    """Raises ValueError unless `folder` is new, or holds only what a killed process left behind.
+
+    Args:
+      instead: what to do otherwise, for the message.
+    """
+    if not folder.exists():
+        return
+    leftover = (LOCK_FILE, PARTIAL)
+    if not folder.is_dir() or any(not p.name.startswith(leftover) for p in folder.iterdir()):
+        raise ValueError(f"--out {folder}: exists and is not empty{instead}")
+
+
 @contextlib.contextmanager
 def locked(folder: Path, wait: bool = False) -> Iterator[None]:
     """Holds the lock of a folder, which is created if it does not exist.

@@ -47,7 +47,7 @@ def newest(run: Path) -> Snapshot:
     Raises:
       ValueError: the folder holds none, or none can be read.
     """
-    if is_passed_on(run):
+    if is_shared(run):
         return history.read(run / history.NETWORK)
     checkpoints = Checkpoints(run)
     if checkpoints.latest() is None:
@@ -55,7 +55,7 @@ def newest(run: Path) -> Snapshot:
     return checkpoints.snapshot()
 
 
-def is_passed_on(run: Path) -> bool:
+def is_shared(run: Path) -> bool:
     """Whether a folder holds a trained network and nothing to go on training with."""
     return (run / history.NETWORK).exists()
 

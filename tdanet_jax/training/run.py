@@ -1,14 +1,11 @@
-"""A training run on disk: chunks of updates, metrics, checkpoints, and going on after a stop."""
+"""A training run on disk: chunks of updates, metrics, checkpoints, and resuming after a stop."""
 
 from __future__ import annotations
 
-import contextlib
-import json
 import time
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,19 +14,15 @@ from jax.sharding import Mesh
 
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.env.types import EnvParams
-from tdanet_jax.io import files
 from tdanet_jax.task import Task
 from tdanet_jax.training import devices, history, learner
 from tdanet_jax.training.checkpoint import Checkpoints
+from tdanet_jax.training.journal import METRICS_FILE, Journal, Row
 from tdanet_jax.training.learner import TrainState
-
-METRICS_FILE = "metrics.jsonl"
-
-Row = dict[str, Any]
 
 
 class Run:
-    """A run in its folder. `state` is where it is, `seconds` the training time so far."""
+    """A run in its folder: `state` is where it stands, `seconds` its training time so far."""
 
     def __init__(
         self,
@@ -38,7 +31,7 @@ class Run:
         task: Task,
         mesh: Mesh | None = None,
     ) -> None:
-        """The run in `folder`, new or as its newest checkpoint has it.
+        """The run in `folder`, new or from its newest checkpoint.
 
         Args:
           mesh: the devices that the environments are split over; by default the first alone.
@@ -60,13 +53,14 @@ class Run:
         self._layout = devices.layout(shapes, self._mesh)
         self.checkpoints = Checkpoints(folder)
         self._saved: int | None = None  # updates of the checkpoint that holds the present state
-        self.state: TrainState = self._begin() if self.fresh else self._restore()
+        self.state: TrainState = self._begin() if self.checkpoints.latest() is None else self._restore()
         self._skipped_before = int(self.state.skipped)
 
     @property
-    def fresh(self) -> bool:
-        """Whether the folder holds no checkpoint yet."""
-        return self.checkpoints.latest() is None
+    def title(self) -> str:
+        """tdanet, split 18/4, seed 0; or tdanet, --odometry, ..."""
+        name = self.task.spec.agent_name(self.config.model)
+        return f"{name}, split {self.task.split.name}, seed {self.config.seed}"
 
     def _init(self, key: jax.Array, words: jax.Array, params: EnvParams) -> TrainState:
         return learner.init(key, self.config.learner, self.model, words, params)
@@ -297,43 +291,3 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
 _UPDATE_MEANS = (
     "policy_loss", "value_loss", "entropy", "explained_variance", "grad_norm", "learning_rate",
 )  # fmt: skip
-
-
-class Journal:
-    """`metrics.jsonl`. Where it cannot be written training goes on, and the rows wait in memory."""
-
-    def __init__(self, path: Path, updates: int) -> None:
-        """Rows behind `updates` belong to updates that will be done again: they are dropped."""
-        self.path = path
-        self._waiting: list[str] = []
-        self._size = 0  # bytes of whole rows
-        if path.exists():
-            kept = [row for row in read_metrics(path.parent) if row["updates"] <= updates]
-            text = "".join(json.dumps(row) + "\n" for row in kept)
-            files.write_text(path, text)
-            self._size = len(text)
-
-    def write(self, row: Row) -> None:
-        """Appends a row, and those that waited; warns once per time that it cannot."""
-        self._waiting.append(json.dumps(row, allow_nan=False) + "\n")
-        try:
-            with self.path.open("ab") as file:
-                file.truncate(min(self._size, file.tell()))  # what an earlier attempt left
-                file.write("".join(self._waiting).encode())
-            self._size = self.path.stat().st_size
-            self._waiting.clear()
-        except OSError as error:
-            if len(self._waiting) == 1:
-                reason = f"cannot be written ({error.strerror}); training goes on"
-                warnings.warn(f"{self.path}: {reason}, its rows wait in memory", stacklevel=2)
-
-
-def read_metrics(folder: Path) -> list[Row]:
-    """The rows of a run's `metrics.jsonl`; a line that was cut short or damaged is left out."""
-    rows = []
-    for line in (folder / METRICS_FILE).read_text(errors="replace").splitlines():
-        with contextlib.suppress(json.JSONDecodeError):
-            row = json.loads(line)
-            if isinstance(row, dict) and isinstance(row.get("updates"), int):
-                rows.append(row)
-    return rows

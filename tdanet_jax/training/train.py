@@ -1,18 +1,15 @@
-"""One way to train: a run in its folder, from its first update to its results."""
+"""The training loop: a run in its folder, from its first update to the end of its budget."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
-from tdanet_jax.evaluation import episodes
-from tdanet_jax.evaluation.evaluate import report_run
 from tdanet_jax.io import files
 from tdanet_jax.models.factory import unused_flags
 from tdanet_jax.task import Task, load_task, resolve
@@ -45,35 +42,24 @@ class Callbacks:
         return contextlib.nullcontext()
 
 
+Result = TypeVar("Result")
+
+
 def train(
     config: TrainConfig | None,
-    folder: Path | str,
+    folder: Path,
+    then: Callable[[Run], Result],
     *,
     resume: bool = False,
     device_count: int = 1,
     tensorboard: bool = False,
-    callbacks: Callbacks | None = None,
-) -> dict[str, Any] | None:
-    """Trains a run to the end of its budget, evaluates it in the test rooms, and writes its report.
+    callbacks: Callbacks,
+) -> Result | None:
+    """Trains a run to the end of its budget; see `tdanet_jax.runs.train`.
 
     Args:
-      config: the run. With `resume`, only its budget counts, as the run's new one; None keeps the
-        run's own.
-      folder: where everything is written; new or empty, unless `resume`.
-      resume: continue the run in `folder` from its newest checkpoint, bit for bit.
-      device_count: devices to split the environments over, in this process.
-      tensorboard: also write TensorBoard events (needs tensorboardX).
-      callbacks: progress, and a way to stop.
-
-    Returns:
-      The content of `results.json`; None if the run was stopped early, and in all processes of a
-      distributed run but the lead.
-
-    Raises:
-      ValueError: a value of the configuration, the folder or a file is not as it must be, or too
-        many updates were not finite; one line that names it.
+      then: called with the finished run while its folder is still locked; its result is returned.
     """
-    folder, callbacks = Path(folder), callbacks or Callbacks()
     if resume:
         config = resumed(folder, config)
     else:
@@ -86,7 +72,7 @@ def train(
     task = load_task(config, callbacks.on_rooms)
     for flag in () if resume else unused_flags(config, task.classes):
         callbacks.on_note(f"note: {flag} changes nothing for {config.model}")
-    # What `auto` means here is part of the run: elsewhere it continues with the same products.
+    # What "auto" means here is part of the run: it continues with the same products elsewhere.
     config = resolve(config)
     with files.locked(folder) if devices.is_lead() else contextlib.nullcontext():
         if devices.is_lead():
@@ -97,23 +83,22 @@ def train(
         devices.wait_for_all("the run is loaded")  # before anyone writes
         callbacks.on_note(f"{run.title} -> {folder}")
         sink = tensorboard_sink(folder) if tensorboard and devices.is_lead() else None
-        if not learn([run], run_rows(run), callbacks, sink) or not devices.is_lead():
+        if not learn([run], ([row] for row in run.chunks()), callbacks, sink):
             return None
-        return finish(run, callbacks)
+        return then(run) if devices.is_lead() else None
 
 
 def train_together(
-    members: Sequence[tuple[TrainConfig, Path]], callbacks: Callbacks | None = None
-) -> bool:
-    """Trains seeds of one configuration in one vmapped call, then reports on each.
+    members: Sequence[tuple[TrainConfig, Path]],
+    then: Callable[[Run], Any],
+    callbacks: Callbacks,
+) -> None:
+    """Trains seeds of one configuration in one vmapped call.
 
     Args:
-      members: configurations that differ in their seed alone, and folders, new or begun.
-
-    Returns:
-      False if they were stopped early.
+      members: configurations that differ in their seed alone, and their folders, new or begun.
+      then: called with each run at the end of the budget; not if they are stopped early.
     """
-    callbacks = callbacks or Callbacks()
     with contextlib.ExitStack() as locks:
         task = load_task(members[0][0], callbacks.on_rooms)
         runs = []
@@ -122,11 +107,9 @@ def train_together(
             prepare(folder, config, task, (folder / CONFIG_FILE).exists(), callbacks)
             runs.append(Run(folder, config, task))
             callbacks.on_note(f"{runs[-1].title} -> {folder}")
-        if not learn(runs, chunks_together(runs), callbacks):
-            return False
-        for run in runs:
-            finish(run, callbacks)
-    return True
+        if learn(runs, chunks_together(runs), callbacks):
+            for run in runs:
+                then(run)
 
 
 def resumed(folder: Path, budget: TrainConfig | None = None) -> TrainConfig:
@@ -154,12 +137,6 @@ def prepare(
         callbacks.on_note(f"removed {path}: half-written when the run was stopped")
     configs.save(config, folder / CONFIG_FILE)
     task.classes.save(folder)
-
-
-def run_rows(run: Run) -> Iterator[list[Row]]:
-    """`Run.chunks`, as a list for each chunk."""
-    for row in run.chunks():
-        yield [row]
 
 
 def learn(
@@ -191,14 +168,3 @@ def learn(
                 saved = save()
         save()
     return True
-
-
-def finish(run: Run, callbacks: Callbacks) -> dict[str, Any]:
-    """Evaluates a run that has ended and writes its learning curve and report."""
-    from tdanet_jax.analysis import figures
-    from tdanet_jax.training.journal import read_metrics
-
-    figures.learning_curve(read_metrics(run.folder), run.title, run.folder / "learning_curve.png")
-    callbacks.on_note("evaluating ...")
-    lists = episodes.load(run.task.tables, run.task.split, run.task.extras)
-    return report_run(run, lists)

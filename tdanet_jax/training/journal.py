@@ -1,0 +1,91 @@
+"""What a run logs: rows of metrics in `metrics.jsonl`, and TensorBoard events."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tdanet_jax.io import files
+
+METRICS_FILE = "metrics.jsonl"
+
+#: One chunk's metrics by name; `steps` and `updates` count from the start of the run.
+Row = dict[str, Any]
+
+
+class Journal:
+    """`metrics.jsonl`. Where it cannot be written training goes on, and the rows wait in memory."""
+
+    def __init__(self, path: Path, updates: int) -> None:
+        """Rows behind `updates` belong to updates that will be done again: they are dropped."""
+        self.path = path
+        self._waiting: list[str] = []
+        self._size = 0  # bytes of whole rows
+        if path.exists():
+            kept = [row for row in read_metrics(path.parent) if row["updates"] <= updates]
+            text = "".join(json.dumps(row) + "\n" for row in kept)
+            files.write_text(path, text)
+            self._size = len(text)
+
+    def write(self, row: Row) -> None:
+        """Appends a row, and those that waited; warns once per time that it cannot."""
+        self._waiting.append(json.dumps(row, allow_nan=False) + "\n")
+        try:
+            with self.path.open("ab") as file:
+                file.truncate(min(self._size, file.tell()))  # what an earlier attempt left
+                file.write("".join(self._waiting).encode())
+            self._size = self.path.stat().st_size
+            self._waiting.clear()
+        except OSError as error:
+            if len(self._waiting) == 1:
+                reason = f"cannot be written ({error.strerror}); training goes on"
+                warnings.warn(f"{self.path}: {reason}, its rows wait in memory", stacklevel=2)
+
+
+def read_metrics(folder: Path) -> list[Row]:
+    """The rows of a run's `metrics.jsonl`; a line that was cut short or damaged is left out."""
+    rows = []
+    for line in (folder / METRICS_FILE).read_text(errors="replace").splitlines():
+        with contextlib.suppress(json.JSONDecodeError):
+            row = json.loads(line)
+            if isinstance(row, dict) and isinstance(row.get("updates"), int):
+                rows.append(row)
+    return rows
+
+
+def tensorboard_sink(folder: Path) -> Callable[[Row], None]:
+    """A function that writes rows as TensorBoard events into `folder`/tensorboard.
+
+    If events cannot be written, it gives up with a warning, and training goes on.
+    """
+    # Not SummaryWriter: its thread dies of a full disk, and its queue then blocks for ever.
+    from tensorboardX.event_file_writer import EventsWriter
+    from tensorboardX.proto.event_pb2 import Event
+    from tensorboardX.summary import scalar
+
+    target = folder / "tensorboard"
+    writer: EventsWriter | None = None
+    failed = False
+
+    def write(row: Row) -> None:
+        nonlocal writer, failed
+        if failed:
+            return
+        try:
+            if writer is None:
+                target.mkdir(exist_ok=True)
+                writer = EventsWriter(str(target / "events"))
+            for name in (name for name in row if name != "steps" and row[name] is not None):
+                summary = scalar(f"train/{name}", row[name])
+                writer.write_event(Event(wall_time=time.time(), step=row["steps"], summary=summary))
+            writer.flush()
+        except OSError as error:
+            failed = True
+            warnings.warn(f"{target}: given up ({error.strerror})", stacklevel=2)
+
+    return write
