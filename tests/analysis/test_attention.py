@@ -18,7 +18,7 @@ def player(opinionated_run, some_rooms):
 def pairs_of(player, tables, pose, target):
     task = player.task
     return attention.class_pairs(
-        player.model, player.weights, task.words, task.eval_params, pose, target,
+        player.model, player.weights, task.words, pose, target, task.eval_params,
         tables.targets, tables.classes,
     )  # fmt: skip
 

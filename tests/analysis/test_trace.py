@@ -179,8 +179,8 @@ def test_a_network_without_attention_has_the_rest(some_rooms, player, chosen):
     assert '"attention":' not in page
     with pytest.raises(ValueError, match="no attention"):
         attention.class_pairs(
-            model, weights, player.task.words, player.task.eval_params, seen.pose[:1],
-            chosen.target[:1], some_rooms.targets, some_rooms.classes,
+            model, weights, player.task.words, seen.pose[:1], chosen.target[:1],
+            player.task.eval_params, some_rooms.targets, some_rooms.classes,
         )  # fmt: skip
 
 

@@ -231,7 +231,7 @@ def test_sampled_actions_follow_the_probabilities_of_the_network(
     many = Episodes(np.repeat(start.pose[:1], 4000), np.repeat(start.target[:1], 4000))
     records = rollout.evaluate(policies.network(MODEL, words), weights, params, many, KEY)
     table = actor_critic.prepare(MODEL, weights, words)
-    state = dynamics.start(jnp.asarray(start.pose[:1]), jnp.asarray(start.target[:1]), params)
+    state = jax.vmap(dynamics.start, (0, 0, None))(start.pose[:1], start.target[:1], params)
     obs = jax.vmap(dynamics.observe, (0, None))(state, params)
     blank = (MODEL.initial_carry(1, weights), obs, jnp.zeros((1, 6)), jnp.ones(1, bool))
     _, out = actor_critic.forward(MODEL, weights, table, *blank)
