@@ -106,15 +106,15 @@ def write_pairs(player: Player, tables: SceneTables, played: Played, out: Path) 
 
     assert player.model is not None
     task = player.task
-    visits = [trace.visited(task.eval_params, *pair) for pair in played.values()]
+    visits = [trace.visited(*pair, task.eval_params) for pair in played.values()]
     pose, target = (np.concatenate(part) for part in zip(*visits, strict=True))
     pairs = attention.class_pairs(
         player.model,
         player.weights,
         task.words,
-        task.eval_params,
         pose,
         target,
+        task.eval_params,
         tables.targets,
         tables.classes,
     )
