@@ -1,4 +1,4 @@
-"""What the commands share at the edge: errors in one line, progress, and stopping on a signal."""
+"""What the commands share at the edge: arguments, errors in one line, and progress."""
 
 from __future__ import annotations
 
@@ -6,15 +6,11 @@ import contextlib
 import datetime
 import io
 import itertools
-import signal
 import sys
-import threading
 import time
-import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Any, NoReturn, TypeVar
 
 import tyro
@@ -30,16 +26,13 @@ from rich.progress import (
 )
 from rich.text import Text
 
-import experiments
-from tdanet_jax.io.files import LOCK_FILE, PARTIAL
+from experiments.signals import Stopped, StopRequest
 from tdanet_jax.splits import GROUPS
 
 Arguments = TypeVar("Arguments")
 
 #: Without a terminal, progress is a line at most this often.
 SECONDS_BETWEEN_LINES = 10.0
-#: After which a stop that waits for an import, or was dropped, is tried again.
-SECONDS_OF_A_MOMENT = 0.05
 
 console = Console(stderr=False, highlight=False, soft_wrap=True)
 
@@ -96,15 +89,6 @@ def _show_warning(message: Warning | str, *_: Any) -> None:
     print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
-def check_empty(folder: Path, instead: str = "") -> None:
-    """Fails unless `folder` is new or holds nothing but what a killed process left half-written."""
-    if not folder.exists():
-        return
-    leftover = (LOCK_FILE, PARTIAL)
-    if not folder.is_dir() or any(not p.name.startswith(leftover) for p in folder.iterdir()):
-        fail(f"--out {folder}: exists and is not empty{instead}")
-
-
 def check_new_file(path: Path, in_folder: bool = True) -> None:
     """Fails if there is something at the path of --out or, with `in_folder`, no folder to hold it.
 
@@ -136,139 +120,6 @@ def check_positive(**flags: int | Sequence[int]) -> None:
         for value in (given,) if isinstance(given, int) else given:
             if value < 1:
                 fail(f"--{name} {value}: must be positive")
-
-
-class Stopped(KeyboardInterrupt):
-    """SIGTERM or Ctrl-C came; `signal` is its number.
-
-    Python drops what is raised while it collects garbage, and some libraries drop what is raised
-    below them. A stop that was dropped, unless it has been answered, is raised again.
-    """
-
-    def __init__(self, number: int, request: StopRequest) -> None:
-        super().__init__()
-        self.signal = number
-        self._request = request
-
-    def __del__(self) -> None:
-        self._request.ask_again()
-
-    def answer(self) -> NoReturn:
-        """Ends the program."""
-        self._request.signal = None
-        experiments.exit_status = 128 + self.signal
-        raise SystemExit(experiments.exit_status) from None
-
-
-class StopRequest:
-    """Turns SIGTERM and Ctrl-C into `Stopped`, at once or, inside `deferred`, at its end.
-
-    While something is imported the first one waits: a library whose import is broken off may crash.
-
-    Attributes:
-      signal: the first one's number, until it is answered.
-    """
-
-    def __init__(self) -> None:
-        self.signal: int | None = None
-        self._deferring = False
-        self._imports = 0  # how deep in imports we are anyway
-        self._alarm: Any = None  # whoever else had SIGALRM
-        self._asked = False  # whether the timer is ours
-
-    @contextlib.contextmanager
-    def deferred(self) -> Iterator[None]:
-        """Inside, the first signal is remembered in `signal`; a second one does not wait."""
-        self._check()
-        self._deferring = True
-        try:
-            yield
-        finally:
-            self._deferring = False
-        self._check()
-
-    def _check(self) -> None:
-        if self.signal is not None:
-            self._stop(self.signal)
-
-    @contextlib.contextmanager
-    def receiving(self) -> Iterator[None]:
-        """Inside, the signals come here, but for those that are ignored; none to other threads."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        self._imports = _imports(sys._getframe())
-        self._alarm = signal.getsignal(signal.SIGALRM)
-        before = {
-            number: signal.signal(number, self._receive)
-            for number in (signal.SIGTERM, signal.SIGINT)
-            if signal.getsignal(number) is not signal.SIG_IGN
-        }
-        before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._receive_alarm)
-        hook = sys.unraisablehook
-        # What is dropped is told to this hook, and would be printed.
-        sys.unraisablehook = lambda told: isinstance(told.exc_value, Stopped) or hook(told)
-        try:
-            yield
-        finally:
-            self._deferring = True  # until whoever had the signals before has them again
-            if self._asked:
-                signal.setitimer(signal.ITIMER_REAL, 0)
-            for number, handler in before.items():
-                signal.signal(number, handler)
-            sys.unraisablehook = hook
-            unanswered, self.signal = self.signal, None
-            if unanswered is not None:
-                signal.raise_signal(unanswered)
-
-    def _receive(self, number: int, frame: FrameType | None) -> None:
-        if self.signal is not None:
-            self._stop(number)
-        self.signal = number
-        self._answer(frame)
-
-    def _receive_alarm(self, number: int, frame: FrameType | None) -> None:
-        if self.signal is not None:
-            self._answer(frame)
-        elif callable(self._alarm):
-            self._alarm(number, frame)
-
-    def _answer(self, frame: FrameType | None) -> None:
-        """Raises `Stopped`, now or later."""
-        if self._deferring:
-            return
-        if _imports(frame) > self._imports:
-            self.ask_again()
-        else:
-            self._check()
-
-    def _stop(self, number: int) -> NoReturn:
-        signal.setitimer(signal.ITIMER_REAL, 0)  # nothing else breaks off the tidying up
-        raise Stopped(number, self)
-
-    def ask_again(self) -> None:
-        """Has `Stopped` raised in a moment if a signal is unanswered; callable in any thread."""
-        if self.signal is not None and not self._deferring:
-            self._asked = True
-            signal.setitimer(signal.ITIMER_REAL, SECONDS_OF_A_MOMENT)
-
-
-def _imports(frame: FrameType | None) -> int:
-    """How many calls of the import system a frame is in."""
-    stack = traceback.walk_stack(frame)
-    return sum(f.f_code.co_filename == "<frozen importlib._bootstrap>" for f, _ in stack)
-
-
-@contextlib.contextmanager
-def stoppable(advice: Callable[[], str]) -> Iterator[StopRequest]:
-    """Inside, SIGTERM or Ctrl-C ends the program: one line of advice, status 128 + signal."""
-    stop = StopRequest()
-    with stop.receiving():
-        try:
-            yield stop
-        except Stopped as stopped:
-            console.print(f"stopped; {advice()}")
-            stopped.answer()
 
 
 class _Figures(ProgressColumn):

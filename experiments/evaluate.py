@@ -11,16 +11,14 @@ evaluations.json, evaluations.md, episodes.jsonl and, of a history, learning_cur
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import json
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from experiments.console import (
-    check_empty,
     console,
     fail,
     one_line_errors,
@@ -29,9 +27,7 @@ from experiments.console import (
     reporter,
 )
 from tdanet_jax.config import TrainConfig
-
-if TYPE_CHECKING:
-    from tdanet_jax.evaluation.saved_networks import Saved
+from tdanet_jax.io import files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,25 +35,25 @@ class Command:
     """Evaluates trained agents, or one that needs no training, on the fixed test episodes."""
 
     checkpoint: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
-    """Folder of a run; its newest checkpoint is evaluated. Give the flag again for more runs: they
-    are played in one compiled call and set beside one another."""
+    """Folder of a run; its newest checkpoint is evaluated. Repeat the flag for more runs: they are
+    played in one compiled call and reported together."""
     history: bool = False
-    """Evaluate the whole history of each run in place of its newest checkpoint, and draw the
+    """Evaluate the whole history of each run instead of its newest checkpoint, and draw the
     learning curve."""
     policy: Literal["sample", "greedy", "random", "shortest_path"] = "sample"
     """sample and greedy: how the network's actions are chosen. random and shortest_path need no
-    checkpoint; the latter knows the way."""
+    checkpoint; the latter knows the room."""
     split: str | None = None
-    """Split of the policies that need no checkpoint, as of the training command; by default 18/4. A
+    """Split for policies that need no checkpoint, as of the training command; by default 18/4. A
     run is evaluated on its own."""
     validation: bool = False
-    """Their episodes are those that `--validation` of the training command leaves for choices."""
+    """Evaluate policies that need no checkpoint on the validation episodes."""
     data: str | None = None
-    """File of rooms that `experiments.scenes import` wrote, in place of those of the run, or of the
-    bundled ones."""
+    """File of rooms that `experiments.scenes import` wrote, instead of the run's or the bundled
+    ones."""
     word_vectors: str | None = None
-    """File of word vectors, where rooms hold classes that the bundled ones lack; for the policies
-    that need no checkpoint. A run has its own."""
+    """File of word vectors for policies that need no checkpoint, if the rooms hold classes that the
+    bundled vectors lack. A run has its own."""
     seed: int | None = None
     """Seed of sampled actions. By default the run's own, which gives the results that its training
     ended with; 0 for the policies that need no checkpoint."""
@@ -85,25 +81,11 @@ def main(arguments: list[str] | None = None) -> None:
             fail(f"--word-vectors {command.word_vectors}: a trained run has its own")
         if len(set(command.checkpoint)) < len(command.checkpoint):
             fail("--checkpoint: a run is given twice")
-        untrained_config(command).check()
+        config = untrained_config(command)
+        config.check()
         folder = command.out or default_folder(command)
-        check_empty(folder)
-        from tdanet_jax.evaluation import saved_networks
-        from tdanet_jax.training import devices
-
-        devices.keep_compiled()
-        if not trained:
-            evaluate_untrained(command, folder)
-            return
-        networks = [
-            n
-            for run in command.checkpoint
-            for n in saved_networks.find(run, command.history, command.data)
-        ]
-        if command.history or len(networks) > 1:
-            evaluate_several(command, networks, folder)
-        else:
-            evaluate_one(command, networks[0], folder)
+        files.check_empty(folder)
+        evaluate(command, config, folder)
 
 
 def default_folder(command: Command) -> Path:
@@ -125,87 +107,28 @@ def untrained_config(command: Command) -> TrainConfig:
     )
 
 
-def evaluate_untrained(command: Command, folder: Path) -> None:
-    """Random or the shortest path."""
-    from tdanet_jax.evaluation import episodes, policies, report, rollout
-    from tdanet_jax.task import load_task
+def evaluate(command: Command, config: TrainConfig, folder: Path) -> None:
+    """Plays the episodes and writes the report."""
+    from tdanet_jax import runs
+    from tdanet_jax.training import devices
 
-    config = untrained_config(command)
-    task = load_task(config)
-    lists = episodes.load(task.tables, task.split, task.extras)
-    make = {"random": policies.random, "shortest_path": policies.shortest_path}[command.policy]
-    played = rollout.evaluate_lists(make(), None, task.eval_params, lists, config.seed)
-    provenance = report.Provenance(
-        split=task.split.name,
-        model=command.policy,
-        policy=command.policy,
-        episodes_trained=0,
-        seed=config.seed,
-        evaluation_seed=config.seed,
-        steps=0,
-        data_version=task.tables.data_version,
-        data=command.data,
-    )
-    folder.mkdir(parents=True, exist_ok=True)
-    print_summary(report.write(folder, provenance, task.tables, played))
-    console.print(f"wrote {folder / report.RESULTS_PAGE}")
-
-
-def evaluate_one(command: Command, network: Saved, folder: Path) -> None:
-    """The newest checkpoint of one run."""
-    from tdanet_jax.evaluation import report, saved_networks
-
-    done = next(saved_networks.evaluate([network], command.policy == "greedy", command.seed))
-    folder.mkdir(parents=True, exist_ok=True)
-    print_summary(report.write(folder, done.provenance, done.task.tables, done.played))
-    console.print(f"wrote {folder / report.RESULTS_PAGE}")
-
-
-def evaluate_several(command: Command, networks: Sequence[Saved], folder: Path) -> None:
-    """Several runs, or the history of one or more."""
-    from tdanet_jax.analysis import figures
-    from tdanet_jax.evaluation import comparison, report, saved_networks
-    from tdanet_jax.io import files
-
-    results, records, played = {}, [], {}
-    greedy = command.policy == "greedy"
-    with reporter("evaluating") as show:
-        for done in saved_networks.evaluate(networks, greedy, command.seed):
-            results[done.saved] = done.results()
-            if not command.history:
-                played[done.saved] = done.columns()
-            where = {"run": str(done.saved.run), "updates": done.snapshot.updates}
-            records += [{**where, **row} for row in report.all_rows(done.task.tables, done.played)]
-            show(len(results) / len(networks), f"{done.saved.run.name} {done.snapshot.updates:,}")
-    ordered: list[comparison.Result] = [results[network] for network in networks]
-    if not command.history:
-        ordered = comparison.with_differences(ordered, [played[network] for network in networks])
-    names = short_names(command.checkpoint)
-    page = comparison.markdown(
-        f"{len(networks)} checkpoints", ordered, [names[network.run] for network in networks]
-    )
-    folder.mkdir(parents=True, exist_ok=True)
-    report.write_rows(folder, records)
-    files.write_text(folder / "evaluations.md", page)
-    if command.history:
-        curves = [
-            comparison.curve(name, [[r for n, r in results.items() if n.run == run]])
-            for run, name in names.items()
-        ]
-        figures.evaluated_curves(
-            curves, "Test rooms, while training", folder / "learning_curve.png"
+    devices.keep_compiled()
+    chosen = command.checkpoint
+    with contextlib.ExitStack() as shown:
+        several = command.history or len(chosen) > 1
+        results = runs.evaluate(
+            None if not chosen else chosen if several else chosen[0],
+            command.policy,
+            config=config,
+            history=command.history,
+            data=command.data,
+            seed=command.seed,
+            out=folder,
+            on_network=shown.enter_context(reporter("evaluating")) if several else None,
         )
-    files.write_text(folder / "evaluations.json", json.dumps(ordered, indent=2) + "\n")
-    console.print(f"wrote {folder / 'evaluations.md'}")
-
-
-def short_names(runs: Sequence[Path]) -> dict[Path, str]:
-    """A name for each run: its folder's, or the whole path where two are called alike."""
-    last = [run.resolve().name for run in runs]
-    return {
-        run: name if last.count(name) == 1 else str(run)
-        for run, name in zip(runs, last, strict=True)
-    }
+    if not several:
+        print_summary(results)
+    console.print(f"wrote {folder / ('evaluations.md' if several else 'results.md')}")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from experiments.console import (
-    check_empty,
     check_positive,
     console,
     one_line_errors,
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from tdanet_jax.scenes import SceneTables
     from tdanet_jax.task import Task
     from tdanet_jax.tools.benchmarking import Row
+from tdanet_jax.io import files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     command = parse(Command, arguments, prog="scaling")
     with one_line_errors():
-        check_empty(command.out)
+        files.check_empty(command.out)
         check_positive(
             environments=command.environments,
             rooms=command.rooms,

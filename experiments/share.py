@@ -12,7 +12,8 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from experiments.console import check_empty, console, one_line_errors, parse
+from experiments.console import console, one_line_errors, parse
+from tdanet_jax.io import files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +30,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     command = parse(Command, arguments, prog="share", description=__doc__)
     with one_line_errors():
-        check_empty(command.out)
+        files.check_empty(command.out)
         from tdanet_jax.evaluation import saved_networks
 
         saved_networks.share(command.checkpoint, command.out)

@@ -3,7 +3,7 @@
     python -m experiments.sweep --splits 18/4 14/8 --seeds 0 1 2 --minutes 10 --out runs/sweep
 
 Every further flag is one of the training command and holds for all runs. After an interruption run
-the same command again: finished runs are skipped, the one that was begun goes on. Writes a folder
+the same command again: finished runs are skipped, the one that was begun continues. Writes a folder
 for each run, report.md, report.json and the learning curves into --out.
 """
 
@@ -11,36 +11,32 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
-from experiments import train_zero_shot
 from experiments.console import (
-    StopRequest,
     check_positive,
     console,
     fail,
     one_line_errors,
     one_line_usage,
     reporter,
-    stoppable,
 )
-from experiments.train_zero_shot import figures_of, parse_command, prepare, report_on, title, train
+from experiments.running import Command as TrainingCommand
+from experiments.running import Reports, how_to_continue, parse_command
+from experiments.signals import stoppable
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
 from tdanet_jax.evaluation import sweep, sweep_report
-from tdanet_jax.evaluation.sweep import Finished
+from tdanet_jax.evaluation.sweep import FinishedRun
 from tdanet_jax.evaluation.sweep_report import Cost
 from tdanet_jax.splits import file_name
-
-if TYPE_CHECKING:
-    from tdanet_jax.training.run import Run
 
 #: Batches whose inference time is reported.
 BATCHES = (1, 1024)
@@ -76,7 +72,7 @@ class Command:
     report_only: bool = False
     """Train nothing; report on the runs in --out that are finished, and on --include."""
     include: tuple[Path, ...] = ()
-    """Finished runs elsewhere that the report takes in."""
+    """FinishedRun runs elsewhere that the report takes in."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -117,17 +113,15 @@ def main(arguments: list[str] | None = None) -> None:
             raise
 
 
-def train_all(
-    command: Command, training: train_zero_shot.Command, configs: Sequence[TrainConfig]
-) -> None:
+def train_all(command: Command, training: TrainingCommand, configs: Sequence[TrainConfig]) -> None:
     """Trains what is not finished.
 
     Args:
       training: the flags of the training command.
       configs: what to train.
     """
-    from tdanet_jax.models.classes import Classes
-    from tdanet_jax.models.registry import make_model
+    from tdanet_jax.models.classes import ClassVocabulary
+    from tdanet_jax.models.factory import make_model
     from tdanet_jax.task import resolve
     from tdanet_jax.training import devices
 
@@ -138,7 +132,7 @@ def train_all(
     # All are looked at before the first trains: a clash shows at once, not after hours, and so does
     # a model that cannot be made.
     for config in configs:
-        make_model(config, Classes())
+        make_model(config, ClassVocabulary())
     states = [sweep.progress(*pair) for pair in zip(folders, configs, strict=True)]
     todo = [
         (config, folder)
@@ -146,59 +140,26 @@ def train_all(
         if state != "finished"
     ]
     console.print(f"{len(configs)} runs, {len(configs) - len(todo)} finished, {len(todo)} to train")
+    from tdanet_jax import runs
+
     if command.vmap_seeds:
         together: dict[tuple[str, str], list[tuple[TrainConfig, Path]]] = {}
         for config, folder in todo:
             together.setdefault((config.split, config.model), []).append((config, folder))
         for members in together.values():
-            train_together(members)
-    else:
-        for config, folder in todo:
-            begun = folder if (folder / CONFIG_FILE).exists() else None
-            train(config, folder, dataclasses.replace(training, resume=begun))
-
-
-def train_together(members: Sequence[tuple[TrainConfig, Path]]) -> None:
-    """Trains seeds of one split and model in one vmapped call, then reports on each."""
-    from tdanet_jax.evaluation import episodes
-    from tdanet_jax.io import files
-    from tdanet_jax.task import load_task
-    from tdanet_jax.training.run import Run
-
-    with stoppable(lambda: "every seed is saved") as stop, contextlib.ExitStack() as locks:
-        with reporter("rooms", transient=True) as show:
-            task = load_task(members[0][0], lambda done, total: show(done / total, "rebuilt"))
-        lists = episodes.load(task.tables, task.split, task.extras)
-        runs = []
-        for config, folder in members:
-            locks.enter_context(files.locked(folder))
-            prepare(folder, config, task, resume=(folder / CONFIG_FILE).exists())
-            runs.append(Run(folder, config, task))
-            console.print(f"{title(runs[-1])} -> {folder}")
-        learn_together(runs, stop)
-        for run in runs:
-            report_on(run, lists)
-
-
-def learn_together(runs: Sequence[Run], stop: StopRequest) -> None:
-    """Trains all to the end of the budget or to a signal, and saves."""
-    from tdanet_jax.training.run import chunks_together
-
-    def save() -> float:
-        for run in runs:
-            run.save()
-        return runs[0].seconds
-
-    saved = save()  # who cannot save learns it before training, not after
-    console.print("compiling ...")
-    with stop.deferred(), reporter("training") as show:
-        for rows in chunks_together(runs):
-            show(runs[0].progress, f"{len(rows)} seeds, each: {figures_of(rows[0])}")
-            if stop.signal is not None:
-                break
-            if runs[0].seconds - saved > 60 * runs[0].config.checkpoint_minutes:
-                saved = save()
-        save()
+            with stoppable(lambda: "every seed is saved") as stop, Reports(stop) as reports:
+                runs.train_together(members, reports)
+        return
+    for config, folder in todo:
+        advice = functools.partial(how_to_continue, folder, config)
+        with stoppable(advice) as stop, Reports(stop) as reports:
+            runs.train(
+                config,
+                folder,
+                resume=(folder / CONFIG_FILE).exists(),
+                device_count=training.devices,
+                callbacks=reports,
+            )
 
 
 @contextlib.contextmanager
@@ -215,7 +176,7 @@ def alone(out: Path) -> Iterator[None]:
         yield
 
 
-def write_report(out: Path, included: Sequence[Finished]) -> None:
+def write_report(out: Path, included: Sequence[FinishedRun]) -> None:
     """Evaluates what is missing, and writes the report on the runs in `out` and on others."""
     from tdanet_jax.analysis import figures
     from tdanet_jax.evaluation import report
@@ -251,7 +212,7 @@ def write_report(out: Path, included: Sequence[Finished]) -> None:
     console.print(f"wrote {out / 'report.md'}")
 
 
-def check_alike(runs: Sequence[Finished], planned: Sequence[Path] = ()) -> None:
+def check_alike(runs: Sequence[FinishedRun], planned: Sequence[Path] = ()) -> None:
     """Fails if the runs, and those in folders where they will be, cannot stand in one table."""
     folders = [run.folder for run in runs]
     names = [folder.name for folder in (*folders, *(set(planned) - set(folders)))]
@@ -263,7 +224,7 @@ def check_alike(runs: Sequence[Finished], planned: Sequence[Path] = ()) -> None:
             fail(f"{run.folder}: was evaluated on other scene tables than {runs[0].folder}")
 
 
-def costs(runs: Sequence[Finished]) -> dict[str, Cost]:
+def costs(runs: Sequence[FinishedRun]) -> dict[str, Cost]:
     """Parameters and inference time of every network among the runs, on this machine, by label."""
     from tdanet_jax.task import load_task
     from tdanet_jax.tools import benchmarking

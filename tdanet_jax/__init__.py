@@ -1,18 +1,61 @@
-"""TDANet in JAX: zero-shot object-goal navigation in the iTHOR rooms, without Unity."""
+"""TDANet in JAX: zero-shot object-goal navigation in the iTHOR rooms, without Unity.
+
+`make` an environment, `train` a run, `evaluate` it, `load` its agent. Importing the package is
+quick: everything heavy is imported when it is first used.
+"""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from tdanet_jax import _moved
 
 if TYPE_CHECKING:
-    from tdanet_jax.agent.agent import Agent
+    from tdanet_jax.agent import Agent, Decision, Detection, load
+    from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+    from tdanet_jax.runs import evaluate, train
+    from tdanet_jax.task import make
+    from tdanet_jax.training.callbacks import Callbacks
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
+
+#: Public names, and the module that each is in.
+_PUBLIC = {
+    "Agent": "agent",
+    "Callbacks": "training.callbacks",
+    "Decision": "agent",
+    "Detection": "agent",
+    "LearnerConfig": "config",
+    "NetworkConfig": "config",
+    "TrainConfig": "config",
+    "evaluate": "runs",
+    "load": "agent",
+    "make": "task",
+    "train": "runs",
+}
+
+__all__ = [
+    "Agent",
+    "Callbacks",
+    "Decision",
+    "Detection",
+    "LearnerConfig",
+    "NetworkConfig",
+    "TrainConfig",
+    "__version__",
+    "evaluate",
+    "load",
+    "make",
+    "train",
+]
 
 
-def load(run: Path | str) -> Agent:
-    """The trained agent of a run's folder; see `tdanet_jax.agent.agent.load`."""
-    from tdanet_jax.agent import agent  # here, so that importing the package stays quick
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        return getattr(importlib.import_module(f"tdanet_jax.{_PUBLIC[name]}"), name)
+    return _moved.attribute(name)
 
-    return agent.load(run)
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_PUBLIC})

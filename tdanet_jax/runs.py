@@ -17,9 +17,9 @@ from tdanet_jax.evaluation.saved_networks import SavedNetwork
 from tdanet_jax.io import files
 from tdanet_jax.task import load_task
 from tdanet_jax.training import train as loop
+from tdanet_jax.training.callbacks import Callbacks
 from tdanet_jax.training.journal import read_metrics
 from tdanet_jax.training.run import Run
-from tdanet_jax.training.train import Callbacks
 
 #: Policies that need no checkpoint.
 UNTRAINED: dict[str, Callable[[], Policy]] = {
@@ -80,7 +80,9 @@ def finish(run: Run, callbacks: Callbacks) -> dict[str, Any]:
     provenance = report.Provenance.of(
         task, config, "sample", config.seed, int(run.state.episodes), int(run.state.updates)
     )
-    return report.write(run.folder, provenance, task.tables, played)
+    results = report.write(run.folder, provenance, task.tables, played)
+    callbacks.on_results(run.folder, results)
+    return results
 
 
 def evaluate(
@@ -154,7 +156,8 @@ def _evaluate_policy(
     name, chosen = ("custom", policy)
     if isinstance(policy, str):
         if policy not in UNTRAINED:
-            raise ValueError(f"policy {policy}: needs a checkpoint, or choose {', '.join(UNTRAINED)}")
+            known = ", ".join(UNTRAINED)
+            raise ValueError(f"policy {policy}: needs a checkpoint, or choose one of {known}")
         name, chosen = policy, UNTRAINED[policy]()
     assert isinstance(chosen, Policy)
     task, seed = load_task(config), config.seed if seed is None else seed

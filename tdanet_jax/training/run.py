@@ -53,7 +53,8 @@ class Run:
         self._layout = devices.layout(shapes, self._mesh)
         self.checkpoints = Checkpoints(folder)
         self._saved: int | None = None  # updates of the checkpoint that holds the present state
-        self.state: TrainState = self._begin() if self.checkpoints.latest() is None else self._restore()
+        fresh = self.checkpoints.latest() is None
+        self.state: TrainState = self._begin() if fresh else self._restore()
         self._skipped_before = int(self.state.skipped)
 
     @property

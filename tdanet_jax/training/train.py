@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,33 +13,9 @@ from tdanet_jax.io import files
 from tdanet_jax.models.factory import unused_flags
 from tdanet_jax.task import Task, load_task, resolve
 from tdanet_jax.training import checkpoint, devices
+from tdanet_jax.training.callbacks import Callbacks
 from tdanet_jax.training.journal import Row, tensorboard_sink
 from tdanet_jax.training.run import Run, chunks_together
-
-
-class Callbacks:
-    """What a caller hears while runs train. Override the methods that you need."""
-
-    def on_rooms(self, done: int, total: int) -> None:
-        """So many of the bundled rooms have been rebuilt; only on a machine's first start."""
-
-    def on_note(self, text: str) -> None:
-        """Something worth a line."""
-
-    def on_rows(self, runs: Sequence[Run], rows: Sequence[Row]) -> None:
-        """A chunk of updates is done: a row of metrics for each of the runs that took part."""
-
-    def should_stop(self) -> bool:
-        """Whether to save and stop after this chunk."""
-        return False
-
-    def on_stop(self) -> None:
-        """The runs stop early, here or because another process does, and are being saved."""
-
-    def shield(self) -> AbstractContextManager[None]:
-        """Entered around work that no signal may interrupt."""
-        return contextlib.nullcontext()
-
 
 Result = TypeVar("Result")
 

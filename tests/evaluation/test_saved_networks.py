@@ -29,7 +29,7 @@ def decision(run: Path) -> np.ndarray:
     return agent.act(agent.start(rotation=45), seen, target="mug")[1].probabilities
 
 
-def test_what_is_passed_on_is_the_network(opinionated_run: Path, tmp_path: Path) -> None:
+def test_what_is_shared_is_the_network(opinionated_run: Path, tmp_path: Path) -> None:
     run, shared = tmp_path / "run", tmp_path / "shared"
     shutil.copytree(opinionated_run, run)
     (run / report.RESULTS_PAGE).write_text("results")

@@ -8,8 +8,8 @@ import pytest
 
 from experiments import benchmark
 from tdanet_jax.config import NetworkConfig, TrainConfig
-from tdanet_jax.models.classes import Classes
-from tdanet_jax.models.registry import make_model
+from tdanet_jax.models.classes import ClassVocabulary
+from tdanet_jax.models.factory import make_model
 from tdanet_jax.tools import benchmarking
 from tests.agent.test_agent import OLD_RUN
 
@@ -86,7 +86,7 @@ def test_the_hand_formula_counts_the_kernels_that_a_step_uses(senses):
     network = NetworkConfig(
         width=32, hidden=48, precision="float32", odometry=odometry, triangulation=triangulation
     )
-    model = make_model(TrainConfig(network=network), Classes())
+    model = make_model(TrainConfig(network=network), ClassVocabulary())
     weights = jax.eval_shape(model.initialise, jax.random.key(0), jnp.ones((5, 50)))
     del weights["encoder"]["attention"]
     kernels = sum(leaf.size for leaf in jax.tree.leaves(weights) if leaf.ndim == 2)

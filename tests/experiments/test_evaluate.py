@@ -16,7 +16,7 @@ from experiments.console import check_empty
 from tdanet_jax import config as configs
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.evaluation import report, saved_networks
-from tdanet_jax.evaluation.saved_networks import Saved
+from tdanet_jax.evaluation.saved_networks import SavedNetwork
 from tdanet_jax.task import make_task
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
@@ -154,7 +154,7 @@ def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch, capsys):
     """Files appear whole or not at all: the same command works again."""
 
     class Done:
-        saved = Saved(tmp_path / "a", TINY)
+        saved = SavedNetwork(tmp_path / "a", TINY)
         snapshot = SimpleNamespace(updates=10)
         task = SimpleNamespace(tables=None)
         played = None
@@ -192,7 +192,7 @@ def test_a_policy_of_ones_own_as_the_page_shows_it(ithor, few_episodes, capsys):
 def test_only_a_point_of_a_history_has_a_share_of_the_budget(tmp_path, point, share):
     snapshot = Snapshot(None, 40, 100, 1.0, 0 if point is None else 5, "d")
     provenance = report.Provenance("18/4", "tdanet", "sample", 100, 0, 0, 1600, "d")
-    done = saved_networks.Evaluated(Saved(tmp_path, TINY, point), snapshot, None, provenance, {})
+    done = saved_networks.Evaluated(SavedNetwork(tmp_path, TINY, point), snapshot, None, provenance, {})
     found = done.results()
     assert (found["point"], found["share"]) == (None if point is None else 5, share)
 

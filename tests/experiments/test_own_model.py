@@ -12,8 +12,8 @@ import tdanet_jax
 from experiments import train_zero_shot
 from tdanet_jax.agent.agent import Detection
 from tdanet_jax.config import NetworkConfig, TrainConfig
-from tdanet_jax.models.classes import Classes
-from tdanet_jax.models.registry import make_model
+from tdanet_jax.models.classes import ClassVocabulary
+from tdanet_jax.models.factory import make_model
 from tests.support import command
 from tests.support.pages import block
 
@@ -59,4 +59,4 @@ def test_a_module_that_makes_no_model_is_refused(tmp_path, monkeypatch):
     for odometry in (False, True):
         config = TrainConfig(model="no_model", network=NetworkConfig(odometry=odometry))
         with pytest.raises(ValueError, match="--model no_model: `make` gives no ActorCritic"):
-            make_model(config, Classes())
+            make_model(config, ClassVocabulary())

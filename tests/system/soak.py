@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax.training.run import read_metrics
+from tdanet_jax.training.journal import read_metrics
 
 FIELDS = ("seconds", "resident_mb", "files", "threads")
 

@@ -29,7 +29,8 @@ from tdanet_jax.evaluation import rollout
 from tdanet_jax.io import assets, files
 from tdanet_jax.scenes import cache
 from tdanet_jax.training.checkpoint import Checkpoints
-from tdanet_jax.training.run import METRICS_FILE, Journal, Run, read_metrics
+from tdanet_jax.training.journal import METRICS_FILE, Journal, read_metrics
+from tdanet_jax.training.run import Run
 from tests.support import command
 from tests.training.test_checkpoint import flip, halve
 

@@ -23,7 +23,7 @@ import pytest
 from tdanet_jax.io import files
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import Checkpoints
-from tdanet_jax.training.run import METRICS_FILE, read_metrics
+from tdanet_jax.training.journal import METRICS_FILE, read_metrics
 from tests.support import command
 
 KILLS = 24

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
-from tdanet_jax.env.dynamics import EnvParams
+from tdanet_jax.env.types import EnvParams
 from tdanet_jax.io import files
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.classes import Classes
+from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.scenes import SceneTables
-from tdanet_jax.models.registry import make_model
+from tdanet_jax.models.factory import make_model
 from tdanet_jax.training import checkpoint
 from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.training.learner import TrainState, init
@@ -31,7 +31,7 @@ from tests.support.handmade import lopsided
 
 def network(width: int) -> ActorCritic:
     config = NetworkConfig(width=width, hidden=8, precision="float32")
-    return make_model(TrainConfig(network=config), Classes())
+    return make_model(TrainConfig(network=config), ClassVocabulary())
 
 
 MODEL = network(8)

@@ -13,11 +13,12 @@ import pytest
 from tdanet_jax import config as configs
 from tdanet_jax import words
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
-from tdanet_jax.models.registry import make_model
+from tdanet_jax.models.factory import make_model
 from tdanet_jax.task import make_task
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import Checkpoints
-from tdanet_jax.training.run import Run, chunks_together, read_metrics
+from tdanet_jax.training.journal import read_metrics
+from tdanet_jax.training.run import Run, chunks_together
 from tests.agent.test_agent import OLD_RUN
 
 #: Eight chunks of two updates of 8 x 5 steps.

@@ -1,0 +1,137 @@
+"""What the commands that train share: their flags, and what they print while runs go on."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from experiments.console import console, parse, print_summary, reporter
+from experiments.signals import StopRequest
+from tdanet_jax.config import CONFIG_FILE, PRESETS, TRUST, TrainConfig
+from tdanet_jax.registry import MODELS
+from tdanet_jax.training.callbacks import Callbacks
+
+if TYPE_CHECKING:
+    from tdanet_jax.training.journal import Row
+    from tdanet_jax.training.run import Run
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Trains an agent on the iTHOR training rooms and reports SR and SPL in the test rooms."""
+
+    run: tyro.conf.OmitArgPrefixes[TrainConfig]
+    preset: Literal["default", "best", "paper"] = "default"
+    """Defaults of the other flags. best: what did best on validation, beyond the paper: --odometry,
+    --triangulation, --gamma 0.97 and --size-noise 0.5. paper: the reference's constants and its
+    budget of 6 M episodes."""
+    out: Path | None = None
+    """Folder for everything that the run writes; must be new or empty."""
+    resume: Path | None = None
+    """Folder of a run to continue. Takes only --devices, --tensorboard and a new budget, which
+    replaces the run's (its schedules then follow the new one)."""
+    tensorboard: bool = False
+    """Also write TensorBoard events (needs tensorboardX)."""
+    devices: int = 1
+    """Devices to split the environments over, in this process; a CPU is split into as many. Further
+    processes, on this machine or others, join through JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES
+    and JAX_PROCESS_ID."""
+
+
+def parse_command(arguments: Sequence[str]) -> Command:
+    """The command line of training; `--preset` chooses the defaults of the other flags."""
+    preset = "default"
+    for i, word in enumerate(arguments):
+        if word.startswith("--preset"):
+            preset = word.partition("=")[2] or "".join(arguments[i + 1 : i + 2])
+    default = Command(run=PRESETS.get(preset, PRESETS["default"]))
+    return parse(Command, arguments, default=default, prog="train_zero_shot")
+
+
+class Reports(Callbacks):
+    """Prints what happens, shows progress, and stops the runs on a signal."""
+
+    def __init__(self, stop: StopRequest) -> None:
+        self._stop = stop
+        self._shown = contextlib.ExitStack()  # the progress bar that is on the screen
+        self._title = ""
+
+    def __enter__(self) -> Reports:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._shown.close()
+
+    def _show(self, title: str, share: float, figures: str) -> None:
+        if title != self._title:
+            self._shown.close()
+            transient = title == "rooms"
+            self._title = title
+            self._report = self._shown.enter_context(reporter(title, transient))
+        self._report(share, figures)
+
+    def on_rooms(self, done: int, total: int) -> None:
+        self._show("rooms", done / total, "rebuilt")
+
+    def on_note(self, text: str) -> None:
+        from tdanet_jax.training import devices
+
+        self._shown.close()
+        self._title = ""
+        console.quiet = not devices.is_lead()
+        console.print(text)
+
+    def on_rows(self, runs: Sequence[Run], rows: Sequence[Row]) -> None:
+        each = f"{len(rows)} seeds, each: " if len(runs) > 1 else ""
+        self._show("training", runs[0].progress, each + figures_of(rows[0]))
+
+    def on_results(self, folder: Path, results: Mapping[str, Any]) -> None:
+        print_summary(results)
+        self.on_note(f"wrote {folder / 'results.md'}")
+
+    def should_stop(self) -> bool:
+        return self._stop.signal is not None
+
+    def on_stop(self) -> None:
+        self._stop.signal = self._stop.signal or signal.SIGTERM
+
+    @contextlib.contextmanager
+    def shield(self) -> Iterator[None]:
+        with self._stop.deferred():
+            yield
+
+
+def figures_of(row: Row) -> str:
+    """The figures next to the progress bar."""
+    skipped = f"  {row['skipped']} updates skipped" if row["skipped"] else ""
+
+    def shown(name: str, factor: float, digits: int) -> str:
+        return "-" if row[name] is None else f"{factor * row[name]:.{digits}f}"
+
+    return (
+        f"{row['steps_per_second']:,.0f} steps/s  {row['episodes']:,} episodes  "
+        f"SR {shown('success', 100, 1)}  SPL {shown('spl', 100, 1)}  "
+        f"entropy {shown('entropy', 1, 2)}{skipped}"
+    )
+
+
+def trust(config: TrainConfig) -> str:
+    """The setting without which commands refuse a run's custom code; none if it has none."""
+    names = [name for name in (config.model,) if name not in MODELS] + [*config.network.sensors]
+    return f"{TRUST}={','.join(names)}" if names else ""
+
+
+def how_to_continue(folder: Path, config: TrainConfig) -> str:
+    """What to say to someone who has stopped a run."""
+    from tdanet_jax.training.checkpoint import Checkpoints
+
+    if not (folder / CONFIG_FILE).exists():
+        return "the run had not begun"
+    again = f"{trust(config)} python -m experiments.train_zero_shot --resume {folder}".lstrip()
+    return f"{Checkpoints(folder).latest() or 0:,} updates are saved; continue with: {again}"

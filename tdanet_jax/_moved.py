@@ -1,0 +1,82 @@
+"""Where the modules of version 0.1 are now: their old names work until 0.3, with a warning."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import sys
+import warnings
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
+
+#: Old module -> new module, below `tdanet_jax`.
+MOVED = {
+    "ai2thor": "agent.ai2thor",
+    "assets": "io.assets",
+    "attention": "analysis.attention",
+    "checkpoint": "training.checkpoint",
+    "classes": "models.classes",
+    "comparison": "evaluation.comparison",
+    "detections": "sensors.detections",
+    "devices": "training.devices",
+    "episode_lookup": "analysis.episode_lookup",
+    "episodes": "evaluation.episodes",
+    "figures": "analysis.figures",
+    "files": "io.files",
+    "graph": "models.class_graph",
+    "history": "training.history",
+    "learner": "training.learner",
+    "measure": "tools.benchmarking",
+    "metrics": "evaluation.metrics",
+    "odometry": "sensors.odometry",
+    "paper": "evaluation.paper",
+    "parameters": "models.parameter_count",
+    "pictures": "analysis.pictures",
+    "policies": "evaluation.policies",
+    "replay": "analysis.replay",
+    "report": "evaluation.report",
+    "returns": "training.gae",
+    "reward": "env.reward",
+    "saved": "evaluation.saved_networks",
+    "scenes.poses": "poses",
+    "sweep": "evaluation.sweep",
+    "trace": "analysis.trace",
+    "triangulation": "sensors.triangulation",
+    "untrusted": "io.untrusted",
+    "zero_shot": "env.zero_shot",
+}
+
+
+def attribute(name: str) -> Any:
+    """An old module, as an attribute of the package: `from tdanet_jax import episodes`."""
+    if name in MOVED:
+        return importlib.import_module(f"tdanet_jax.{name}")
+    raise AttributeError(f"module 'tdanet_jax' has no attribute {name!r}")
+
+
+class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Finds old modules: gives the new one in their place."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        package, _, name = fullname.partition(".")
+        if package != "tdanet_jax" or name not in MOVED:
+            return None
+        return importlib.util.spec_from_loader(fullname, self)
+
+    def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType:
+        new = f"tdanet_jax.{MOVED[spec.name.partition('.')[2]]}"
+        message = f"{spec.name} is now {new}; the old name works until version 0.3"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        return importlib.import_module(new)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """The module is loaded already; it gets its own spec back."""
+        module.__spec__ = importlib.util.spec_from_loader(module.__name__, module.__loader__)
+
+
+sys.meta_path.append(_Finder())
