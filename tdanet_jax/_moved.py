@@ -53,8 +53,16 @@ MOVED = {
 def attribute(name: str) -> Any:
     """An old module, as an attribute of the package: `from tdanet_jax import episodes`."""
     if name in MOVED:
-        return importlib.import_module(f"tdanet_jax.{name}")
+        return importlib.import_module(_warn(name, stacklevel=4))
     raise AttributeError(f"module 'tdanet_jax' has no attribute {name!r}")
+
+
+def _warn(name: str, stacklevel: int) -> str:
+    """Warns of an old name; returns the new one."""
+    new = f"tdanet_jax.{MOVED[name]}"
+    message = f"tdanet_jax.{name} is now {new}; the old name works until version 0.3"
+    warnings.warn(message, DeprecationWarning, stacklevel=stacklevel)
+    return new
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
@@ -69,10 +77,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         return importlib.util.spec_from_loader(fullname, self)
 
     def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType:
-        new = f"tdanet_jax.{MOVED[spec.name.partition('.')[2]]}"
-        message = f"{spec.name} is now {new}; the old name works until version 0.3"
-        warnings.warn(message, DeprecationWarning, stacklevel=2)
-        return importlib.import_module(new)
+        return importlib.import_module(_warn(spec.name.partition(".")[2], stacklevel=3))
 
     def exec_module(self, module: ModuleType) -> None:
         """The module is loaded already; it gets its own spec back."""
