@@ -32,7 +32,8 @@ def find_make(flag: str, name: str, module: str) -> Callable[..., Any]:
     """The function `make` of a model's or sensor's module.
 
     Args:
-      flag, name: the flag that asks for it and its value, for the message.
+      flag: the flag that asks for it, for the message.
+      name: the flag's value.
       module: dotted name.
 
     Raises:

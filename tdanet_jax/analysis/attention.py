@@ -124,9 +124,11 @@ def class_pairs(
     """Mean attention by class pair over frames.
 
     Args:
-      pose: [N] int, target: [N] int, of each frame. Repeated frames are computed once and counted
-        as often as they occur.
-      targets, classes: the tables' names.
+      pose: [N] int, of each frame. Repeated frames are computed once and counted as often as they
+        occur.
+      target: [N] int, likewise.
+      targets: names of the tables' targets.
+      classes: names of the tables' classes.
 
     Raises:
       ValueError: the network has no attention.

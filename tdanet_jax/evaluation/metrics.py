@@ -44,7 +44,8 @@ def difference(
     for both does not widen the intervals (the paired bootstrap).
 
     Args:
-      ours, theirs: `success`, `shortest`, `length` and `cluster` of the episodes (`summarise`).
+      ours: `success`, `shortest`, `length` and `cluster` of the episodes (`summarise`).
+      theirs: the same of the other agent.
 
     Returns:
       What `summarise` gives, of the differences; they are percentage points.

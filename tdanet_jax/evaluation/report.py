@@ -86,7 +86,8 @@ class Provenance:
 
         Args:
           config: the network's run, with the rooms of the evaluation.
-          episodes, updates: how long the network was trained.
+          episodes: training episodes of the network.
+          updates: training updates of the network.
         """
         network = policy in ("sample", "greedy")
         return cls(
