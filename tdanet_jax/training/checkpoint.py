@@ -1,7 +1,7 @@
-"""Checkpoints of a run (Orbax): everything that is needed to go on bit for bit.
+"""Checkpoints of a run (Orbax): everything that is needed to continue bit for bit.
 
 `DIR/checkpoints/<updates>/` holds `state` (parameters, optimiser, episodes in progress, recurrent
-state, random key, counters; plain arrays, whichever devices they lay on), `meta` (JSON: format
+state, random key, counters; plain arrays, whichever devices held them), `meta` (JSON: format
 version, training time, data version) and `SHA256SUMS`, the checksums of all its files
 (`sha256sum -c SHA256SUMS` checks them, too).
 """
@@ -15,25 +15,30 @@ import shutil
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+from flax import traverse_util
 
 from tdanet_jax.io import assets, files
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
-from tdanet_jax.training.learner import TrainState
+from tdanet_jax.training.renames import renamed
 
-FORMAT = 1
+if TYPE_CHECKING:
+    from tdanet_jax.training.learner import TrainState
+
+#: Version of the files' layout; a newer one is refused, an older one renamed (`renames`).
+FORMAT = 2
 FOLDER = "checkpoints"
 CHECKSUMS = "SHA256SUMS"
 KEPT = 2
 
-# Orbax narrates every file it touches, and every error that it raises besides.
+# Orbax logs every file it touches, and every error that it also raises.
 logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
@@ -42,7 +47,7 @@ class NewerFormat(ValueError):
 
 
 def newest(run: Path) -> Snapshot:
-    """The network of a run's newest checkpoint, or of a folder that was passed on.
+    """The network of a run's newest checkpoint, or of a shared agent's folder.
 
     Raises:
       ValueError: the folder holds none, or none can be read.
@@ -56,7 +61,7 @@ def newest(run: Path) -> Snapshot:
 
 
 def is_shared(run: Path) -> bool:
-    """Whether a folder holds a trained network and nothing to go on training with."""
+    """Whether a folder holds a shared agent: a network, and nothing to continue training from."""
     return (run / history.NETWORK).exists()
 
 
@@ -109,7 +114,7 @@ class Checkpoints:
             kept = f"the one before it is {self.latest()}" if self._steps() else "there is no other"
             reason = f"checkpoint not written ({_reason(error)}); {kept}"
             raise ValueError(f"{path}: {reason}") from error
-        # Anything ahead of this one is what could not be read when the run went on from behind it.
+        # A later one is damaged: the run has continued from an earlier one instead.
         keep = [step for step in self._steps() if step <= updates][:KEPT]
         for step in set(self._steps()) - set(keep):
             shutil.rmtree(self.folder / str(step))
@@ -120,7 +125,7 @@ class Checkpoints:
         return next(iter(self._steps()), None)
 
     def restore(self, make_state: Callable[[], TrainState]) -> tuple[TrainState, dict[str, Any]]:
-        """The newest checkpoint that can be read; a damaged one is passed over with a warning.
+        """The newest checkpoint that can be read; a damaged one is skipped with a warning.
 
         Args:
           make_state: makes a state of the right shapes; only traced, never run.
@@ -160,7 +165,7 @@ class Checkpoints:
             try:
                 found = self._read_one(self.folder / str(step), blank)
             except NewerFormat:
-                raise  # it is sound: no older one shall be taken in its place
+                raise  # it is sound: no older one may replace it
             except (ValueError, OSError) as error:
                 faults.append(error)
                 continue
@@ -178,7 +183,9 @@ class Checkpoints:
                 read = self._orbax.restore(
                     path, args=ocp.args.Composite(state=ocp.args.StandardRestore())
                 )
-                state = read["state"] if blank is None else _fitted(read["state"], blank)
+                leaves = jax.tree_util.tree_leaves_with_path(read["state"])
+                found = renamed({_name(place): leaf for place, leaf in leaves}, written)
+                state = _nested(found) if blank is None else _fitted(found, blank)
         except Exception as error:  # Orbax raises many kinds for a damaged folder
             raise ValueError(f"{path}: unreadable checkpoint ({_reason(error)})") from error
         if written > FORMAT:
@@ -189,8 +196,13 @@ class Checkpoints:
         return state, dict(meta["meta"])
 
 
-def _fitted(values: Any, blank: Any) -> Any:
-    """The tree of `blank` with the values that have the same names in another tree.
+def _nested(found: Mapping[str, Any]) -> Any:
+    """Nested dictionaries from leaves by name."""
+    return traverse_util.unflatten_dict(found, sep="/")
+
+
+def _fitted(found: Mapping[str, Any], blank: Any) -> Any:
+    """The tree of `blank` with the leaves that have the same names.
 
     By name, because a later version of the state may have further parts that are None here, which
     the files of an earlier one do not mention.
@@ -198,7 +210,6 @@ def _fitted(values: Any, blank: Any) -> Any:
     Raises:
       ValueError: names, shapes or types differ.
     """
-    found = {_name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(values)}
     wanted = {_name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(blank)}
     for name in sorted(found.keys() ^ wanted.keys()):
         raise ValueError(f"{name} is {'missing' if name in wanted else 'of no use here'}")
@@ -218,7 +229,7 @@ def _name(path: tuple[Any, ...]) -> str:
 
 @contextlib.contextmanager
 def _quiet_threads() -> Iterator[None]:
-    """Orbax's threads hand their errors to the caller; inside, they do not print them besides."""
+    """Keeps Orbax's threads from printing the errors that they also hand to the caller."""
     before = threading.excepthook, sys.unraisablehook
     threading.excepthook, sys.unraisablehook = lambda error: None, lambda error: None
     try:
@@ -234,7 +245,7 @@ def _give_memory_back() -> None:
 
 
 def _check_space(folder: Path, content: Any) -> None:
-    """Raises OSError if the disk cannot hold a state. Orbax finds out, too, but half-way."""
+    """Raises OSError if the disk cannot hold a state. Orbax would only find out half-way."""
     needed = sum(array.nbytes for array in jax.tree.leaves(content))
     free = shutil.disk_usage(folder).free
     if free < needed:

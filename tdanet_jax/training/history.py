@@ -1,9 +1,9 @@
 """The parameters of a run at fixed shares of its budget, for learning curves and later analysis.
 
 `DIR/history/<updates>.npz` holds the parameters alone, by their path in the network
-(`encoder/linear2/kernel`), and where the run was, behind names that begin with @.
-Checkpoints, which resume a run, hold three times as much, and only the newest are kept. A folder
-that is passed on has neither, but one such file beside its configuration, `NETWORK`.
+(`encoder/linear2/kernel`), and where the run was, under names that begin with @.
+Checkpoints, which resume a run, are three times as large, and only the newest are kept. A shared
+agent's folder has neither, but one such file next to its configuration, `NETWORK`.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ import numpy as np
 from flax import traverse_util
 
 from tdanet_jax.io import files
+from tdanet_jax.training.renames import renamed
 
 FOLDER = "history"
 SUFFIX = ".npz"
-#: The network of a folder that is passed on (`saved.share`).
+#: The network of a shared agent's folder (`saved_networks.share`).
 NETWORK = "network.npz"
-#: Version of the files' layout; `read` refuses a newer one.
-FORMAT = 1
+#: Version of the files' layout; `read` refuses a newer one, and renames in an older one.
+FORMAT = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +73,7 @@ def save(path: Path, snapshot: Snapshot, half: bool = False) -> None:
     """Writes a snapshot; the file appears complete or not at all.
 
     Args:
-      half: keeps 16 bits of each parameter (float16).
+      half: keep 16 bits of each parameter (float16).
 
     Raises:
       ValueError: a parameter is too large for that.
@@ -110,7 +111,8 @@ def read(path: Path) -> Snapshot:
         )
     if written is None or where.keys() != _WHERE:
         raise ValueError(f"{path}: not a point of a run's history")
-    return Snapshot(weights=traverse_util.unflatten_dict(content, sep="/"), **where)
+    weights = traverse_util.unflatten_dict(renamed(content, written), sep="/")
+    return Snapshot(weights=weights, **where)
 
 
 def checksums(path: Path) -> list[tuple[str, int]]:
@@ -132,7 +134,7 @@ def points(run: Path) -> list[Path]:
 
 
 def drop_after(run: Path, updates: int) -> None:
-    """Deletes the points behind a checkpoint: their updates will be done again."""
+    """Deletes the points after a checkpoint: their updates will be done again."""
     files.remove_partial(run / FOLDER)
     for path in points(run):
         if int(path.stem) > updates:
