@@ -1,5 +1,7 @@
 """Configurations: defaults, presets, JSON and errors."""
 
+from __future__ import annotations
+
 import dataclasses
 import json
 import re

@@ -1,5 +1,7 @@
 """A trained agent on its own: what it decides is what the network in the environment decides."""
 
+from __future__ import annotations
+
 import dataclasses
 import json
 import shutil

@@ -1,5 +1,7 @@
 """Attention by class pair, against a plain loop."""
 
+from __future__ import annotations
+
 import csv
 
 import numpy as np

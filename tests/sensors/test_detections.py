@@ -1,5 +1,7 @@
 """Rows of detections, by hand and against a plain loop."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 

@@ -1,5 +1,7 @@
 """Commands as a user types them, in a process of their own."""
 
+from __future__ import annotations
+
 import os
 import subprocess
 import sys

@@ -1,5 +1,7 @@
 """Every model compiles for a GPU. Slow: `pytest -m slow tests/system/test_gpu.py`; see gpu.py."""
 
+from __future__ import annotations
+
 import importlib.util
 import json
 import os
