@@ -1,4 +1,4 @@
-"""Traces: the same way, and the same thoughts, as when the episode was played."""
+"""Traces: the same poses, and the same outputs of the network, as when the episode was played."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_objects_of_a_class_share_the_weight_of_its_merged_row(some_rooms, playe
     assert several
 
 
-def test_the_shortest_path_has_a_way_and_no_thoughts(some_rooms, player, chosen):
+def test_the_shortest_path_has_poses_and_no_outputs(some_rooms, player, chosen):
     best = Player("shortest path", player.task)
     for i in range(0, len(chosen), 3):
         seen = trace.play(best, some_rooms, one(chosen, i))
@@ -195,15 +195,15 @@ def test_what_has_no_box_is_not_in_view(some_rooms):
 
 
 def test_a_recorded_episode_is_shown_as_it_happened(some_rooms, player, opinionated_run):
-    ways = set()
+    outcomes = set()
     rows = [json.loads(row) for row in (opinionated_run / "episodes.jsonl").open()]
     for i, row in enumerate(rows):
         record = episode_lookup.read_record(opinionated_run, i, some_rooms)
         seen = trace.retrace(player, some_rooms, record.episode, record.actions)
         assert seen.success == row["success"]
         np.testing.assert_array_equal(seen.actions, record.actions)
-        ways.add(seen.outcome.split(",")[0])
-    assert len(ways) > 1
+        outcomes.add(seen.outcome.split(",")[0])
+    assert len(outcomes) > 1
 
 
 def test_frames_in_which_an_action_was_chosen(some_rooms, player, chosen):

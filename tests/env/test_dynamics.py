@@ -108,7 +108,7 @@ def assert_valid_start(world: World, state: EnvState, row: int) -> None:
 
 
 def parents_seen(params: EnvParams, state: EnvState, tables: SceneTables) -> set[str]:
-    """The names behind a state's bit set."""
+    """The names that a state's bit set stands for."""
     parents = np.asarray(params.parent_class[int(state.target)])
     return {tables.classes[c] for i, c in enumerate(parents) if int(state.parents_seen) >> i & 1}
 

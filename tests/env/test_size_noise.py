@@ -23,9 +23,9 @@ from tests.support.oracle import ROOMS
 BATCH, STEPS, NOISE = 128, 40, 0.5
 
 
-def params_of(tables: SceneTables, noise: float, senses: bool = False) -> EnvParams:
+def params_of(tables: SceneTables, noise: float, sensors: bool = False) -> EnvParams:
     targets = dict.fromkeys(ROOMS, tables.targets)
-    spec = ObservationSpec(sensors=("odometry", "triangulation") if senses else ())
+    spec = ObservationSpec(sensors=("odometry", "triangulation") if sensors else ())
     return make_params(tables, targets, no_parents(tables), (7,) * 4, spec, size_noise=noise)
 
 

@@ -32,13 +32,15 @@ NAMES = ["18/4", "14/8", "18/4-validation", "own-validation"]
 
 
 def config_of(
-    split: str, validation: bool, rows: Any = "class", senses: bool = False
+    split: str, validation: bool, rows: Any = "class", sensors: bool = False
 ) -> TrainConfig:
     return TrainConfig(
         split=split,
         validation=validation,
         learner=LearnerConfig(num_envs=16, rollout_steps=8, step_limit=6),
-        network=NetworkConfig(width=8, hidden=8, rows=rows, odometry=senses, triangulation=senses),
+        network=NetworkConfig(
+            width=8, hidden=8, rows=rows, odometry=sensors, triangulation=sensors
+        ),
     )
 
 
@@ -169,11 +171,11 @@ def training_walk(params: EnvParams) -> tuple[Any, ...]:
 
 
 @pytest.mark.parametrize("split", SPLITS, ids=NAMES)
-@pytest.mark.parametrize(("rows", "senses"), [("class", False), ("object", True)])
+@pytest.mark.parametrize(("rows", "sensors"), [("class", False), ("object", True)])
 def test_perturbing_all_hidden_data_changes_nothing_that_training_reads(
-    rooms: SceneTables, glove: WordVectors, split: tuple[str, bool], rows: str, senses: bool
+    rooms: SceneTables, glove: WordVectors, split: tuple[str, bool], rows: str, sensors: bool
 ) -> None:
-    config = config_of(*split, rows, senses)
+    config = config_of(*split, rows, sensors)
     hidden = make_split(*split).hidden
     task = make_task(config, rooms, glove)
     noisy = perturbed(rooms, hidden, seed=1)

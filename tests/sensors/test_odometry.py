@@ -213,7 +213,7 @@ def test_compiled_is_eager_and_many_are_one_by_one() -> None:
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *alone)
     given = (*np.array(starts).T, *(np.stack(x) for x in zip(*walks, strict=True)))
     together = jax.vmap(functools.partial(walked, map_too=True))(*given)
-    close = {"rtol": 1e-6, "atol": 1e-6}  # sines and cosines may be computed in another way
+    close = {"rtol": 1e-6, "atol": 1e-6}  # sines and cosines may be computed by another formula
     chex.assert_trees_all_close(together, stacked, **close)
     state = begun(1, 1)
     for t, (action, flag) in enumerate(zip(*walks[1], strict=True), start=1):

@@ -212,7 +212,7 @@ class World:
         return away
 
     def distance(self, state: int, target: str) -> int | None:
-        """Fewest moves from a state until the target is visible, None if there is no way."""
+        """Fewest moves from a state until the target is visible, None if there is none."""
         scene = int(self.tables.position_scene[state // 16])
         return self.distances(scene, target).get(state)
 
@@ -317,7 +317,7 @@ def generalised_advantages(
 ) -> list[float]:
     """GAE of one piece of an episode, as the sum that defines it.
 
-    `last_value` is the value of the state behind the last step: 0 where the episode ended there,
+    `last_value` is the value of the state after the last step: 0 where the episode ended there,
     the critic's where it was cut (by a step limit or by the end of the rollout).
     """
     values = [step.value for step in episode] + [last_value]

@@ -68,7 +68,7 @@ def write_room(folder: Path) -> None:
 
 
 def write_all(root: Path) -> Path:
-    """A training and a test kitchen with everything that lies beside them; returns the scenes'
+    """A training and a test kitchen with everything that lies next to them; returns the scenes'
     folder, which is two folders below the episodes, as in the reference."""
     scenes = root / "data" / "thor_v1_offline_data"
     write_room(scenes / "FloorPlan1")

@@ -193,7 +193,7 @@ FAULTS = (
           "training/test_learner.py"),
     Fault("carry of the last episode", "models/actor_critic.py", "is_first=done",
           "is_first=jnp.zeros_like(done)", "training/test_learner.py"),
-    Fault("no value behind the rollout", LEARNER, "return after, steps, out.value",
+    Fault("no value after the rollout", LEARNER, "return after, steps, out.value",
           "return after, steps, 0 * out.value", "training/test_learner.py"),
     Fault("infinite updates applied", LEARNER, "jnp.where(finite, new, old)", "new",
           "training/test_learner.py"),
