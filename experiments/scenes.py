@@ -86,13 +86,11 @@ class Verify:
             "test": [room for room in rooms if room.name not in train],
         }
         groups = {"22 targets": ALL_TARGETS, "possible parents": PARENT_CANDIDATES}
-        for line in agreement.table(parts, groups, RULES, self.worst):
-            console.print(line)
+        console.print(*agreement.table(parts, groups, RULES, self.worst), sep="\n")
         console.print(dense_rays.summary(rooms, RULES, self.rooms, self.views))
         with reporter("rooms") as report:
             tables = load_tables(lambda done, total: report(done / total, "rebuilt"))
-        for line in survey.summary(tables):
-            console.print(line)
+        console.print(*survey.summary(tables), sep="\n")
         console.print(f"{time.monotonic() - start:.0f} s")
 
 
@@ -192,9 +190,8 @@ class Import:
             maps = features.find_features(self.source)
         remove_abandoned(self.out, maps_out)
         rooms = self._rooms()
-        for lines in (survey.summary(rooms.tables), survey.uses(rooms)):
-            for line in lines:
-                console.print(line)
+        console.print(*survey.summary(rooms.tables), sep="\n")
+        console.print(*survey.uses(rooms), sep="\n")
         if maps is None:
             dataset.save_rooms(rooms, self.out)
         else:

@@ -29,6 +29,7 @@ from tdanet_jax.vocabulary import ROOM_TYPES, VISIBILITY_DISTANCE
 
 ASSET = "ithor.npz"
 UNIT = 1e-4  # metres; lengths in the file are whole numbers of this unit
+FLAGS = ("openable", "is_open", "pickupable", "visible")
 METADATA = "procthor/databases/ai2thor-object-metadata.json"
 LAYOUT = "alfworld/gen/layouts/{name}-layout.npy"
 
@@ -122,10 +123,7 @@ def _room_arrays(scene: Scene) -> dict[str, Any]:
         "object_rotation": np.rint([[1000 * a for a in o.rotation] for o in items]).astype(
             np.int32
         ),  # thousandths of a degree
-        "object_openable": np.array([item.openable for item in items]),
-        "object_is_open": np.array([item.is_open for item in items]),
-        "object_pickupable": np.array([item.pickupable for item in items]),
-        "object_visible": np.array([bool(item.visible) for item in items]),
+        **{f"object_{flag}": np.array([bool(getattr(o, flag)) for o in items]) for flag in FLAGS},
         "object_parents": np.array([len(rows) for rows in parents], np.int16),
         "parent": np.array([index for rows in parents for index in rows], np.int16),
     }
@@ -184,9 +182,6 @@ def _object(data: dict[str, np.ndarray], row: int, name: str, parents: list[str]
         box=data["object_box"][row] * UNIT,
         corners=data["corners"][corner] * UNIT if corner >= 0 else None,
         rotation=(float(rotation[0]), float(rotation[1]), float(rotation[2])),
-        openable=bool(data["object_openable"][row]),
-        is_open=bool(data["object_is_open"][row]),
-        pickupable=bool(data["object_pickupable"][row]),
         parents=tuple(parents),
-        visible=bool(data["object_visible"][row]),
+        **{flag: bool(data[f"object_{flag}"][row]) for flag in FLAGS},
     )

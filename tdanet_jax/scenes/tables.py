@@ -24,6 +24,24 @@ from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene, SceneObject
 from tdanet_jax.vocabulary import FIELD_OF_VIEW, IMAGE_SIZE
 
+#: Field -> dtype, shape, least value, and the axis that its values are indices of. In addition to
+#: the axes above, T are the room types and F the units of `row_box` along the image.
+FIELDS: dict[str, tuple[str, tuple[Any, ...], int, str]] = {
+    "room_type": ("int8", ("R",), 0, "T"),
+    "position": ("float64", ("P", 3), 0, ""),
+    "position_scene": ("int16", ("P",), 0, "R"),
+    "next_position": ("int32", ("P", 8), 0, "P"),
+    "row_start": ("int32", ("S + 1",), 0, ""),
+    "row_object": ("int32", ("N",), 0, "O"),
+    "row_box": ("int16", ("N", 4), -1, "F"),
+    "row_visible": ("bool", ("N",), 0, ""),
+    "object_class": ("int16", ("O",), 0, "C"),
+    "object_scene": ("int16", ("O",), 0, "R"),
+    "object_box": ("float64", ("O", 6), 0, ""),
+    "distance": ("int16", ("S", "G"), 0, ""),
+    "raster": ("int8", ("S", 7, 7), -1, "C"),
+}
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SceneTables:
@@ -123,32 +141,23 @@ class SceneTables:
         wanted = set(names)
         for name in sorted(wanted - set(self.scenes)):
             raise SceneError(f"{name}: no such scene in these tables")
-        scene_kept = np.array([name in wanted for name in self.scenes])
-        kept_p = scene_kept[self.position_scene]
-        kept_s = np.repeat(kept_p, VIEWS)
-        kept_o = scene_kept[self.object_scene]
-        kept_n = kept_o[self.row_object]
-        new_scene = (np.cumsum(scene_kept) - 1).astype(np.int16)
-        new_position = (np.cumsum(kept_p) - 1).astype(np.int32)
-        new_object = (np.cumsum(kept_o) - 1).astype(np.int32)
-        return dataclasses.replace(
-            self,
-            scenes=tuple(name for name in self.scenes if name in wanted),
-            object_id=tuple(np.array(self.object_id, object)[kept_o]),
-            room_type=self.room_type[scene_kept],
-            position=self.position[kept_p],
-            position_scene=new_scene[self.position_scene[kept_p]],
-            next_position=new_position[self.next_position[kept_p]],
-            row_start=row_offsets(np.diff(self.row_start)[kept_s]),
-            row_object=new_object[self.row_object[kept_n]],
-            row_box=self.row_box[kept_n],
-            row_visible=self.row_visible[kept_n],
-            object_class=self.object_class[kept_o],
-            object_scene=new_scene[self.object_scene[kept_o]],
-            object_box=self.object_box[kept_o],
-            distance=self.distance[kept_s],
-            raster=self.raster[kept_s],
-        )
+        scenes = np.array([name in wanted for name in self.scenes])
+        positions, objects = scenes[self.position_scene], scenes[self.object_scene]
+        kept = {
+            "R": scenes, "P": positions, "S": np.repeat(positions, VIEWS), "O": objects,
+            "N": objects[self.row_object],
+        }  # fmt: skip
+        arrays: dict[str, Any] = {
+            "row_start": row_offsets(np.diff(self.row_start)[kept["S"]]),
+            "object_id": tuple(np.array(self.object_id, object)[objects]),
+        }
+        for field, (dtype, shape, _, indexed) in FIELDS.items():
+            if field not in arrays:
+                arrays[field] = getattr(self, field)[kept[shape[0]]]
+            if indexed in kept:
+                arrays[field] = (np.cumsum(kept[indexed]) - 1).astype(dtype)[arrays[field]]
+        names = tuple(name for name in self.scenes if name in wanted)
+        return dataclasses.replace(self, scenes=names, **arrays)
 
     def with_known_targets(self) -> SceneTables:
         """The tables without the targets that are not among the classes."""

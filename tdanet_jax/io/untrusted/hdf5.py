@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -66,19 +67,12 @@ class Reader:
             raise FileError(self._path, f"{name} is not numeric")
         if shape is not None and dataset.shape != shape:
             raise FileError(self._path, f"{name} has shape {dataset.shape}, not {shape}")
-        largest = max(_count(dataset.shape), _count(dataset.chunks or ()))
+        largest = max(math.prod(map(int, s)) for s in (dataset.shape, dataset.chunks or ()))
         if largest > LARGEST:
             raise FileError(self._path, f"{name} has {largest} numbers, more than {LARGEST}")
         stored = dataset.id.get_create_plist()
         if any(stored.get_filter(i)[0] not in _FILTERS for i in range(stored.get_nfilters())):
             raise FileError(self._path, f"{name} has an unsupported compression filter")
-
-
-def _count(shape: tuple[int, ...]) -> int:
-    total = 1
-    for size in shape:
-        total *= int(size)
-    return total
 
 
 def need_h5py(path: Path) -> None:

@@ -5,6 +5,7 @@ The rules of visibility were chosen to agree with these flags, see `visibility/r
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -20,36 +21,32 @@ from tdanet_jax.scenes.visibility.rules import Rules
 class Confusion:
     """Counts of our yes-or-no answers against those of a reference."""
 
-    true_positives: int = 0
-    false_positives: int = 0
-    false_negatives: int = 0
+    tp: int = 0  # both yes
+    fp: int = 0  # ours only
+    fn: int = 0  # the reference's only
 
     def __add__(self, other: Confusion) -> Confusion:
-        return Confusion(
-            self.true_positives + other.true_positives,
-            self.false_positives + other.false_positives,
-            self.false_negatives + other.false_negatives,
-        )
+        return Confusion(self.tp + other.tp, self.fp + other.fp, self.fn + other.fn)
 
     @property
     def errors(self) -> int:
         """Number of answers that differ."""
-        return self.false_positives + self.false_negatives
+        return self.fp + self.fn
 
     @property
     def precision(self) -> float:
         """Share of our yeses that the reference confirms."""
-        return self.true_positives / max(self.true_positives + self.false_positives, 1)
+        return self.tp / max(self.tp + self.fp, 1)
 
     @property
     def recall(self) -> float:
         """Share of the reference's yeses that are ours."""
-        return self.true_positives / max(self.true_positives + self.false_negatives, 1)
+        return self.tp / max(self.tp + self.fn, 1)
 
     @property
     def f1(self) -> float:
         """Harmonic mean of precision and recall."""
-        return 2 * self.true_positives / max(2 * self.true_positives + self.errors, 1)
+        return 2 * self.tp / max(2 * self.tp + self.errors, 1)
 
 
 def default_frame(scene: Scene, rules: Rules) -> np.ndarray:
@@ -65,14 +62,13 @@ def default_frame(scene: Scene, rules: Rules) -> np.ndarray:
 
 def by_class(scenes: Iterable[Scene], rules: Rules) -> dict[str, Confusion]:
     """Agreement with AI2-THOR's flags in the default frames, by object class."""
-    result: dict[str, Confusion] = {}
+    result: defaultdict[str, Confusion] = defaultdict(Confusion)
     for scene in scenes:
-        for item, ours in zip(scene.objects, default_frame(scene, rules), strict=True):
-            theirs = bool(item.visible)
-            case = Confusion(
-                int(ours and theirs), int(ours and not theirs), int(theirs and not ours)
-            )
-            result[item.object_class] = result.get(item.object_class, Confusion()) + case
+        theirs = np.array([bool(item.visible) for item in scene.objects])
+        ours = default_frame(scene, rules)
+        cases = np.stack([ours & theirs, ours & ~theirs, theirs & ~ours], axis=1).astype(int)
+        for item, case in zip(scene.objects, cases.tolist(), strict=True):
+            result[item.object_class] += Confusion(*case)
     return result
 
 
@@ -105,6 +101,5 @@ def table(
         line = f"{title:18}"
         for column in columns:
             c = sum((column[name] for name in members if name in column), Confusion())
-            line += f" {c.true_positives:4} {c.false_positives:3} {c.false_negatives:3} "
-            line += f"{c.precision:.2f} {c.recall:.2f} {c.f1:.3f} "
+            line += f" {c.tp:4} {c.fp:3} {c.fn:3} {c.precision:.2f} {c.recall:.2f} {c.f1:.3f} "
         yield line

@@ -7,25 +7,8 @@ from typing import Any
 import numpy as np
 
 from tdanet_jax.scenes.scene import MOST_CLASSES
-from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.scenes.tables import FIELDS, SceneTables
 from tdanet_jax.vocabulary import ROOM_TYPES
-
-#: Field -> dtype, shape, least value, and the axis that its values are indices of.
-_FIELDS: dict[str, tuple[str, tuple[Any, ...], int, str]] = {
-    "room_type": ("int8", ("R",), 0, "T"),
-    "position": ("float64", ("P", 3), 0, ""),
-    "position_scene": ("int16", ("P",), 0, "R"),
-    "next_position": ("int32", ("P", 8), 0, "P"),
-    "row_start": ("int32", ("S + 1",), 0, ""),
-    "row_object": ("int32", ("N",), 0, "O"),
-    "row_box": ("int16", ("N", 4), -1, "F"),
-    "row_visible": ("bool", ("N",), 0, ""),
-    "object_class": ("int16", ("O",), 0, "C"),
-    "object_scene": ("int16", ("O",), 0, "R"),
-    "object_box": ("float64", ("O", 6), 0, ""),
-    "distance": ("int16", ("S", "G"), 0, ""),
-    "raster": ("int8", ("S", 7, 7), -1, "C"),
-}
 
 
 def find_problem(tables: SceneTables) -> str | None:
@@ -41,7 +24,7 @@ def find_problem(tables: SceneTables) -> str | None:
             return "names that are not text"
     if min(sizes[letter] for letter in "RPOC") == 0 or sizes["C"] > MOST_CLASSES:
         return f"no rooms, positions, objects or classes, or over {MOST_CLASSES} classes"
-    for field, (dtype, shape, low, high) in _FIELDS.items():
+    for field, (dtype, shape, low, high) in FIELDS.items():
         value: Any = getattr(tables, field)
         wanted = tuple(sizes.get(size, size) for size in shape)
         if not isinstance(value, np.ndarray) or value.dtype != dtype or value.shape != wanted:

@@ -13,19 +13,8 @@ import numpy as np
 
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import hdf5
-from tdanet_jax.scenes.offline.layout import (
-    BOX_FILE,
-    FEATURE_FILE,
-    FEATURE_SHAPE,
-    GRAPH_FILE,
-    GRID_FILE,
-    OBJECT_FILE,
-    PARENT_FILE,
-    ROOM_NAMES,
-    VISIBILITY_FILES,
-    Report,
-    state_keys,
-)
+from tdanet_jax.scenes.offline import layout
+from tdanet_jax.scenes.offline.layout import Report, state_keys
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.visibility.geometry import transitions
 from tdanet_jax.vocabulary import ROOM_TYPES
@@ -62,11 +51,13 @@ def write_folder(
             folder.mkdir()
             write_scene(room, folder)
             if features:
-                write_features(room, folder / FEATURE_FILE)
+                write_features(room, folder / layout.FEATURE_FILE)
             report((i + 1) / len(tables.scenes), name)
         if parents:
-            titled = {ROOM_NAMES[ROOM_TYPES.index(r)]: targets for r, targets in parents.items()}
-            _write(temporary / PARENT_FILE, titled)
+            titled = {
+                layout.ROOM_NAMES[ROOM_TYPES.index(r)]: targets for r, targets in parents.items()
+            }
+            _write(temporary / layout.PARENT_FILE, titled)
         if vectors is not None:
             write_vectors(tables.classes, vectors, temporary / "thor_glove")
         os.replace(temporary, out)
@@ -77,13 +68,13 @@ def write_folder(
 def write_scene(room: SceneTables, folder: Path) -> None:
     """Writes grid, graph, visibility map (under both names), boxes and objects of a room."""
     keys = state_keys(room.position)
-    _write(folder / GRID_FILE, [dict(zip("xyz", point, strict=True)) for point in
+    _write(folder / layout.GRID_FILE, [dict(zip("xyz", point, strict=True)) for point in
                                 room.position.tolist()])  # fmt: skip
-    _write(folder / GRAPH_FILE, graph(room, keys))
-    for name in VISIBILITY_FILES[:2]:
+    _write(folder / layout.GRAPH_FILE, graph(room, keys))
+    for name in layout.VISIBILITY_FILES[:2]:
         _write(folder / name, visible_from(room, keys))
-    _write(folder / BOX_FILE, boxes(room, keys))
-    _write(folder / OBJECT_FILE, objects(room, keys))
+    _write(folder / layout.BOX_FILE, boxes(room, keys))
+    _write(folder / layout.OBJECT_FILE, objects(room, keys))
 
 
 def graph(room: SceneTables, keys: Sequence[str]) -> dict[str, Any]:
@@ -153,7 +144,7 @@ def write_features(room: SceneTables, path: Path) -> None:
 
     with h5py.File(path, "w") as file:
         for key, raster in zip(state_keys(room.position), room.raster, strict=True):
-            channel = np.arange(FEATURE_SHAPE[0])[:, None, None]
+            channel = np.arange(layout.FEATURE_SHAPE[0])[:, None, None]
             values = (raster[None] == channel).astype(np.float32)
             file.create_dataset(key, data=values, compression="gzip", compression_opts=1)
 

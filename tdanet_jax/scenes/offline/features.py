@@ -13,14 +13,8 @@ from tdanet_jax.io.untrusted import FileError, hdf5
 from tdanet_jax.poses import VIEWS
 from tdanet_jax.scenes import dataset
 from tdanet_jax.scenes.dataset import Rooms
-from tdanet_jax.scenes.offline.layout import (
-    FEATURE_FILE,
-    FEATURE_SHAPE,
-    Grid,
-    Report,
-    find_root,
-    find_scenes,
-)
+from tdanet_jax.scenes.offline import layout
+from tdanet_jax.scenes.offline.layout import Grid, Report, find_root, find_scenes
 from tdanet_jax.scenes.tables import SceneTables
 
 
@@ -30,7 +24,7 @@ def find_features(folder: Path) -> dict[str, Path]:
     Raises:
       FileError: a scene has none, or h5py is not installed.
     """
-    found = {name: place / FEATURE_FILE for name, _, place in find_scenes(find_root(folder))}
+    found = {name: place / layout.FEATURE_FILE for name, _, place in find_scenes(find_root(folder))}
     for path in found.values():
         hdf5.need_h5py(path)
         if not path.is_file():
@@ -66,7 +60,9 @@ def write_features(
     Raises:
       FileError: a feature file is broken.
     """
-    features = np.lib.format.open_memmap(out, "w+", np.float16, (tables.num_states, *FEATURE_SHAPE))
+    features = np.lib.format.open_memmap(
+        out, "w+", np.float16, (tables.num_states, *layout.FEATURE_SHAPE)
+    )
     for i, name in enumerate(tables.scenes):
         here = np.flatnonzero(tables.position_scene == i)
         count = _copy_features(
@@ -84,7 +80,7 @@ def _copy_features(path: Path, grid: Grid, features: np.ndarray, first: int) -> 
         for key in reader.names():
             state = grid.state(path, key)
             with np.errstate(over="ignore"):  # an overflow is infinite, and refused below
-                values = reader.read(key, FEATURE_SHAPE).astype(np.float16)
+                values = reader.read(key, layout.FEATURE_SHAPE).astype(np.float16)
             if not np.isfinite(values).all():
                 raise FileError(path, f"{key} has numbers beyond half precision")
             features[first + state] = values
@@ -110,6 +106,6 @@ def load_features(data: Path, tables: SceneTables) -> np.ndarray:
         features = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, OSError) as error:
         raise FileError(path, f"not an array ({error})") from None
-    if features.shape != (tables.num_states, *FEATURE_SHAPE) or features.dtype != np.float16:
+    if features.shape != (tables.num_states, *layout.FEATURE_SHAPE) or features.dtype != np.float16:
         raise FileError(path, f"{features.shape} {features.dtype}: not the maps of these rooms")
     return features

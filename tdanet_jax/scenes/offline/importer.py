@@ -16,30 +16,25 @@ from tdanet_jax.io import archive, files
 from tdanet_jax.io.untrusted import FileError, npz
 from tdanet_jax.scenes import cache
 from tdanet_jax.scenes.dataset import Rooms
+from tdanet_jax.scenes.offline import layout
 from tdanet_jax.scenes.offline.extras import read_extras
 from tdanet_jax.scenes.offline.features import load_features as load_features  # its former place
-from tdanet_jax.scenes.offline.layout import (
-    BOX_FILE,
-    GRAPH_FILE,
-    GRID_FILE,
-    OBJECT_FILE,
-    VISIBILITY_FILES,
-    Grid,
-    Report,
-    find_root,
-    find_scenes,
-    scene_of,
-)
-from tdanet_jax.scenes.offline.reader import SceneData, read_scene
-from tdanet_jax.scenes.scene import MOST_CLASSES, Scene, SceneObject
+from tdanet_jax.scenes.offline.layout import Grid, Report, find_root, find_scenes
+from tdanet_jax.scenes.offline.reader import read_scene
+from tdanet_jax.scenes.scene import MOST_CLASSES
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.tabulation import join, tabulate
-from tdanet_jax.scenes.visibility.build import Detections
 from tdanet_jax.vocabulary import ALL_TARGETS
 
-SOURCES = (GRID_FILE, GRAPH_FILE, BOX_FILE, OBJECT_FILE, *VISIBILITY_FILES)
+SOURCES = (
+    layout.GRID_FILE,
+    layout.GRAPH_FILE,
+    layout.BOX_FILE,
+    layout.OBJECT_FILE,
+    *layout.VISIBILITY_FILES,
+)
 #: Version of the cached scenes, and part of their name.
-FORMAT = 1
+FORMAT = 2
 
 
 def read_folder(folder: Path, report: Report) -> Rooms:
@@ -59,19 +54,19 @@ def read_folder(folder: Path, report: Report) -> Rooms:
     chosen = find_scenes(root)
     cached = _cache_folder(root)
     cache.touch(cached)
-    rooms: list[SceneData] = []
+    rooms: list[SceneTables] = []
     for name, room_type, place in chosen:
-        data = _read_cached(cached, place, name, room_type)
-        rooms.append(data)
-        report(len(rooms) / len(chosen), data.describe())
+        room, line = _read_cached(cached, place, name, room_type)
+        rooms.append(room)
+        report(len(rooms) / len(chosen), line)
     for other in sorted(root.glob("FloorPlan*")):
-        if other.is_dir() and scene_of(other.name) is None:
+        if other.is_dir() and layout.scene_of(other.name) is None:
             report(1.0, f"{other.name}: left out, not one of iTHOR's 120 rooms")
-    grids = {data.scene.name: Grid(data.scene.points) for data in rooms}
+    grids = {room.scenes[0]: Grid(room.position) for room in rooms}
     extras, lines = read_extras(_near(folder, root), grids)
     for line in lines:
         report(1.0, line)
-    result = Rooms(make_tables(root, rooms), extras)
+    result = Rooms(join_rooms(root, rooms), extras)
     lost = {p for targets in extras.parents.values() for names in targets.values() for p in names}
     if lost := lost - set(result.tables.classes):
         report(
@@ -87,18 +82,16 @@ def _near(folder: Path, root: Path) -> list[Path]:
     return list(dict.fromkeys(places))
 
 
-def make_tables(root: Path, rooms: Sequence[SceneData]) -> SceneTables:
-    """The tables of all rooms, with their own classes, and the targets among these.
+def join_rooms(root: Path, rooms: Sequence[SceneTables]) -> SceneTables:
+    """The tables of all rooms, with all their classes, and the targets among these.
 
     Raises:
       FileError: there are more classes than the raster can number.
     """
-    classes = tuple(sorted({o.object_class for data in rooms for o in data.scene.objects}))
+    classes = sorted({name for room in rooms for name in room.classes})
     if len(classes) > MOST_CLASSES:
         raise FileError(root, f"{len(classes)} classes, more than {MOST_CLASSES}")
-    targets = tuple(name for name in ALL_TARGETS if name in classes)
-    parts = [tabulate(d.scene, d.next_position, d.detections, classes, targets) for d in rooms]
-    return join(parts, classes, targets)
+    return join(rooms, classes).with_known_targets()
 
 
 def _cache_folder(root: Path) -> Path:
@@ -106,56 +99,29 @@ def _cache_folder(root: Path) -> Path:
     return cache.folder() / f"{cache.IMPORTS}{FORMAT}-{name}"
 
 
-def _read_cached(cached: Path, place: Path, name: str, room_type: int) -> SceneData:
-    """A scene from the cache, if it was read from files of equal sizes and dates, or its folder."""
+def _read_cached(cached: Path, place: Path, name: str, room_type: int) -> tuple[SceneTables, str]:
+    """A scene and a line on it, cached if it was read from files of equal sizes and dates."""
     path = cached / f"{name}.npz"
     stamp = _stamp(place)
-    with contextlib.suppress(OSError, ValueError, KeyError):
-        if path.is_file():
-            stored = npz.read(path)
-            note = json.loads(stored["note"].tobytes())
-            if note["stamp"] == stamp:
-                return _unpack(stored, note)
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        arrays = npz.read(path)
+        note = json.loads(arrays["import/note"].tobytes())
+        if note["stamp"] == stamp:
+            return SceneTables.from_arrays(arrays), note["line"]
     data = read_scene(place, name, room_type)
+    room = tabulate(data.scene, data.next_position, data.detections, ALL_TARGETS)
+    note = json.dumps({"stamp": stamp, "line": data.describe()}).encode()
     with contextlib.suppress(OSError):  # without a cache, an import starts again
         cached.mkdir(parents=True, exist_ok=True)
         with files.replacing(path) as temporary:
-            archive.write(temporary, _pack(data, stamp))
-    return data
+            arrays = {**room.to_arrays(), "import/note": np.frombuffer(note, np.uint8)}
+            archive.write(temporary, arrays, compress=True)
+    return room, data.describe()
 
 
 def _stamp(place: Path) -> list[list[Any]]:
     found = [place / name for name in SOURCES if (place / name).is_file()]
     return [[f.name, f.stat().st_size, f.stat().st_mtime_ns] for f in found]
-
-
-def _pack(data: SceneData, stamp: list) -> dict[str, np.ndarray]:
-    scene, found = data.scene, data.detections
-    note = {
-        "stamp": stamp, "name": scene.name, "room_type": scene.room_type, "found": data.found,
-        "noted": data.noted, "objects": [[o.object_id, o.object_class] for o in scene.objects],
-    }  # fmt: skip
-    return {
-        "note": np.frombuffer(json.dumps(note).encode(), np.uint8),
-        "points": scene.points,
-        "boxes": np.array([item.box for item in scene.objects]),
-        "next_position": data.next_position,
-        "state": found.state, "owner": found.owner, "box": found.box, "visible": found.visible,
-    }  # fmt: skip
-
-
-def _unpack(stored: dict[str, np.ndarray], note: dict) -> SceneData:
-    objects = tuple(
-        SceneObject(name, kind, box)
-        for (name, kind), box in zip(note["objects"], stored["boxes"], strict=True)
-    )
-    return SceneData(
-        Scene(note["name"], note["room_type"], stored["points"], objects),
-        stored["next_position"],
-        Detections(*(stored[name] for name in ("state", "owner", "box", "visible"))),
-        tuple(note["found"]),
-        tuple(note["noted"]),
-    )
 
 
 def clear_cache(folder: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -136,8 +136,3 @@ class Grid:
         if point is None or np.abs(steps - cell).max() * GRID_SIZE > ALIGNED:
             raise FileError(path, f"state {key} is not on the grid of grid.json")
         return poses.from_degrees(point, rotation, horizon)
-
-
-def first_file(folder: Path, names: Sequence[str]) -> Path | None:
-    """The first of `names` that is a file in `folder`."""
-    return next((folder / name for name in names if (folder / name).is_file()), None)

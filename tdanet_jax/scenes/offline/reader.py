@@ -14,15 +14,8 @@ from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.poses import GRID_SIZE, HORIZONS, ROTATIONS, STEPS, VIEWS
 from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.metadata import FARTHEST, check_points
-from tdanet_jax.scenes.offline.layout import (
-    BOX_FILE,
-    GRAPH_FILE,
-    GRID_FILE,
-    OBJECT_FILE,
-    VISIBILITY_FILES,
-    Grid,
-    first_file,
-)
+from tdanet_jax.scenes.offline import layout
+from tdanet_jax.scenes.offline.layout import Grid
 from tdanet_jax.scenes.offline.matching import MOST_OBJECTS, UNKNOWN, BoxMatcher, Objects
 from tdanet_jax.scenes.scene import SUBPIXEL, Scene
 from tdanet_jax.scenes.visibility.build import Detections
@@ -56,29 +49,29 @@ def read_scene(folder: Path, name: str, room_type: int) -> SceneData:
     Raises:
       FileError: a file is missing or broken, or contradicts another.
     """
-    grid = read_grid(folder / GRID_FILE)
-    next_position, odd = read_graph(folder / GRAPH_FILE, grid)
-    source = first_file(folder, VISIBILITY_FILES)
-    if source is None:
-        raise FileError(folder, f"none of {', '.join(VISIBILITY_FILES)}")
-    objects = read_visibility(source, grid)
-    found = [f"{len(grid.points)} points", f"{source.name} ({len(objects.classes)} objects)"]
+    grid = read_grid(folder / layout.GRID_FILE)
+    next_position, odd = read_graph(folder / layout.GRAPH_FILE, grid)
+    sources = [folder / n for n in layout.VISIBILITY_FILES if (folder / n).is_file()]
+    if not sources:
+        raise FileError(folder, f"none of {', '.join(layout.VISIBILITY_FILES)}")
+    objects = read_visibility(sources[0], grid)
+    found = [f"{len(grid.points)} points", f"{sources[0].name} ({len(objects.classes)} objects)"]
     noted = list(odd)
     owners: dict[int, list[str]] | None = None
-    if (folder / OBJECT_FILE).is_file():
-        owners = read_objects(folder / OBJECT_FILE, grid, objects)
-        found.append(OBJECT_FILE)
+    if (folder / layout.OBJECT_FILE).is_file():
+        owners = read_objects(folder / layout.OBJECT_FILE, grid, objects)
+        found.append(layout.OBJECT_FILE)
     boxes: Iterator[tuple[int, dict[str, np.ndarray]]] = iter(())
-    if (folder / BOX_FILE).is_file():
-        boxes = read_boxes(folder / BOX_FILE, grid)
+    if (folder / layout.BOX_FILE).is_file():
+        boxes = read_boxes(folder / layout.BOX_FILE, grid)
     else:
-        noted.append(f"no {BOX_FILE}, so no detections")
-    matcher = BoxMatcher(folder / BOX_FILE, objects, owners)
+        noted.append(f"no {layout.BOX_FILE}, so no detections")
+    matcher = BoxMatcher(folder / layout.BOX_FILE, objects, owners)
     matcher.add(boxes)
     scene, detections = matcher.finish(name, room_type, grid.points)
     boxed = int((detections.box[:, 0] >= 0).sum())
     if boxed:
-        found.append(f"{BOX_FILE} ({boxed} boxes)")
+        found.append(f"{layout.BOX_FILE} ({boxed} boxes)")
     if boxed and len(detections.box) > boxed:
         noted.append(f"{len(detections.box) - boxed} times an object is visible and has no box")
     return SceneData(scene, next_position, detections, tuple(found), tuple(noted))

@@ -20,7 +20,7 @@ from tdanet_jax.scenes import SceneTables, dataset, tabulation
 from tdanet_jax.scenes.offline import exporter, features, importer, layout, reader
 from tdanet_jax.scenes.offline.layout import OBJECT_FILE, state_keys
 from tdanet_jax.splits import make_split
-from tdanet_jax.vocabulary import TARGETS
+from tdanet_jax.vocabulary import ALL_TARGETS, TARGETS
 from tests.support import original, toy
 
 
@@ -92,6 +92,10 @@ def test_the_layout_alone_holds_transitions_visibility_and_boxes(
         np.testing.assert_array_equal(a, b)
 
 
+def tables_of(data: reader.SceneData) -> SceneTables:
+    return tabulation.tabulate(data.scene, data.next_position, data.detections, ALL_TARGETS)
+
+
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=8)
 def test_random_rooms(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
@@ -102,10 +106,10 @@ def test_random_rooms(tmp_path_factory: pytest.TempPathFactory, seed: int) -> No
     folder.mkdir()
     exporter.write_scene(room, folder)
     data = reader.read_scene(folder, "FloorPlan5", 0)
-    assert_equal(room, importer.make_tables(folder, [data]))
+    assert_equal(room, tables_of(data))
     (folder / OBJECT_FILE).unlink()
     data = reader.read_scene(folder, "FloorPlan5", 0)
-    back = importer.make_tables(folder, [data])
+    back = tables_of(data)
     assert detections(back, exact=False) == detections(room, exact=False)
 
 
@@ -250,9 +254,9 @@ def test_scenes_that_changed_since_are_read_anew(
         (3, lambda: (parts / "FloorPlan1.npz").write_bytes(b"damaged")),
     ):
         change()
-        data = importer._read_cached(parts, place, "FloorPlan1", 0)
+        room, _ = importer._read_cached(parts, place, "FloorPlan1", 0)
         assert len(read) == times
-        assert len(data.detections.state) == 6
+        assert len(room.row_object) == 6
 
 
 def test_folders_that_hold_no_scenes(tmp_path: Path) -> None:
