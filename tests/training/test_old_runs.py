@@ -1,0 +1,102 @@
+"""Runs of format 1, from before the names of today: they load, evaluate and resume as they did.
+
+`expected.json` holds what the code that wrote the runs made of them: an agent's second decision,
+eight test episodes, and the next update.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import tdanet_jax
+from tdanet_jax import config as configs
+from tdanet_jax.agent.agent import Detection
+from tdanet_jax.config import CONFIG_FILE
+from tdanet_jax.evaluation import episodes, policies, rollout
+from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.scenes import SceneTables
+from tdanet_jax.task import Task, make_task
+from tdanet_jax.training.checkpoint import FORMAT, Checkpoints, newest
+from tdanet_jax.training.renames import renamed
+from tdanet_jax.training.run import Run
+from tdanet_jax.vocabulary import Action
+from tdanet_jax.words import WordVectors
+
+DATA = Path(__file__).parents[1] / "data"
+#: With odometry and triangulation; and a network that adapts, in the middle of its episodes.
+NAMES = ("run_format_1_best", "run_format_1_savn")
+
+
+@pytest.fixture(params=NAMES)
+def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    return shutil.copytree(DATA / request.param, tmp_path / request.param)
+
+
+@pytest.fixture
+def task(run: Path, ithor: SceneTables, glove: WordVectors) -> Task:
+    return make_task(configs.load(run / CONFIG_FILE), ithor, glove)
+
+
+def expected(run: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((run / "expected.json").read_text())
+    return content
+
+
+def test_the_next_update_is_that_of_the_old_code(run: Path, task: Task) -> None:
+    there = expected(run)
+    again = Run(run, configs.load(run / CONFIG_FILE), task)
+    assert int(again.state.updates) == there["row"]["updates"] - 1
+    [row] = again.chunks()
+    there["row"]["bootstrap_only_steps"] = there["row"].pop("held_steps")
+    for name, value in there["row"].items():
+        assert row[name] == (None if value is None else pytest.approx(value, rel=2e-4)), name
+    again.save()
+    state, _ = Checkpoints(run)._read(None)
+    leaves = {
+        jax.tree_util.keystr(path, simple=True, separator="/"): np.asarray(leaf, np.float64)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(state)
+    }
+    norms = {name: float(np.linalg.norm(leaf)) for name, leaf in leaves.items() if name != "key"}
+    there["norms"].pop("key")
+    assert norms == pytest.approx(renamed(there["norms"], 1), rel=5e-3, abs=1e-12)
+    meta = json.loads((run / f"checkpoints/{row['updates']}/meta/metadata").read_text())
+    assert meta["format"] == FORMAT == 2
+
+
+def test_it_plays_as_in_the_old_code(run: Path, task: Task) -> None:
+    lists = episodes.load(task.tables, task.split)
+    few = {name: Episodes(found.pose[::250], found.target[::250]) for name, found in lists.items()}
+    policy = policies.network(task.model, task.words)
+    played = rollout.evaluate_lists(policy, newest(run).weights, task.eval_params, few, 0)
+    for group, (_, records) in played.items():
+        there = expected(run)["episodes"][group]
+        assert records.length.tolist() == there["length"]
+        assert records.success.tolist() == there["success"]
+        assert int(records.actions.astype(int).clip(0).sum()) == there["last_action_sum"]
+
+
+def test_its_agent_decides_as_in_the_old_code(tmp_path: Path) -> None:
+    run = shutil.copytree(DATA / NAMES[0], tmp_path / "run")
+    agent = tdanet_jax.load(run)
+    seen = [Detection("sink", 0.1, 0.2, 0.4, 0.5), Detection("coffee machine", 0.5, 0.5, 0.75, 1.0)]
+    state = agent.start(rotation=45)
+    for _ in range(2):
+        state, decision = agent.act(state, seen, "sink", blocked=False)
+        state = state._replace(action=np.int32(Action.MOVE_AHEAD))
+    there = expected(run)["second_decision"]
+    np.testing.assert_allclose(decision.probabilities, there["probabilities"], atol=1e-6)
+    np.testing.assert_allclose(decision.value, there["value"], atol=1e-6)
+
+
+def test_new_names_stay_as_they_are() -> None:
+    state, _ = Checkpoints(DATA / NAMES[1])._read(None)
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    names = {jax.tree_util.keystr(path, simple=True, separator="/"): 0 for path, _ in leaves}
+    assert renamed(names, 1) == renamed(names, 2) == names
