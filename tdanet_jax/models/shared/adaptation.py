@@ -165,6 +165,8 @@ class AdaptiveActorCritic(ActorCritic):
             return super().__call__(
                 class_table, carry, obs, prev_action_probs, is_first, dropout_mask
             )
+        if self.is_mutable_collection("intermediates"):
+            self.sow("intermediates", "attention", self.encoder.attend(class_table, obs))
         network = Network(self.clone(parent=None), self.variables["params"], class_table)
         inputs = StepInputs(self.view(obs), prev_action_probs, is_first, dropout_mask)
         return (network.act if is_first.ndim == 1 else network.rollout)(carry, inputs)
