@@ -8,19 +8,17 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import jax
-import numpy as np
 import pytest
 
 from experiments import evaluate
-from experiments.console import check_empty
 from tdanet_jax import config as configs
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.evaluation import report, saved_networks
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
+from tdanet_jax.io.files import check_empty
 from tdanet_jax.task import make_task
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
-from tdanet_jax.vocabulary import Action
 from tests.agent.test_agent import OLD_RUN
 from tests.evaluation.test_comparison import result as made_up
 from tests.support import command, samples
@@ -176,23 +174,25 @@ def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch, capsys):
     assert len((out / "episodes.jsonl").read_text().splitlines()) == 1000
 
 
-def test_a_policy_of_ones_own_as_the_page_shows_it(ithor, few_episodes, capsys):
-    there = {}
-    exec(block("evaluation.md", "own_policy.py"), there)
-    lines = capsys.readouterr().out.splitlines()
-    for line, (group, (_, records)) in zip(lines, there["played"].items(), strict=True):
-        assert line.startswith(f"{group} {{'SR': {100 * records.success.mean():.1f}, ")
-        assert 0.1 < records.success.mean() < 0.5
-        last = records.actions[np.arange(100), records.length - 1]
-        assert (last[records.success] == Action.DONE).all()
-    assert list(there["played"]) == ["seen", "unseen"]
+def test_a_custom_policy_as_the_page_shows_it(ithor, few_episodes, capsys):
+    names = {}
+    exec(block("evaluation.md", "own_policy.py"), names)
+    groups = {group: names["results"][group]["L>=1"] for group in ("seen", "unseen")}
+    said = [f"{group} {found}" for group, found in groups.items()]
+    assert capsys.readouterr().out.splitlines() == said
+    for found in groups.values():
+        assert found["n"] == 100
+        assert 10 < found["SR"] < 50
+    assert names["results"]["policy"] == "custom"
 
 
 @pytest.mark.parametrize(("point", "share"), [(None, None), (Path("history/00000040.npz"), 0.25)])
 def test_only_a_point_of_a_history_has_a_share_of_the_budget(tmp_path, point, share):
     snapshot = Snapshot(None, 40, 100, 1.0, 0 if point is None else 5, "d")
     provenance = report.Provenance("18/4", "tdanet", "sample", 100, 0, 0, 1600, "d")
-    done = saved_networks.Evaluated(SavedNetwork(tmp_path, TINY, point), snapshot, None, provenance, {})
+    done = saved_networks.Evaluated(
+        SavedNetwork(tmp_path, TINY, point), snapshot, None, provenance, {}
+    )
     found = done.results()
     assert (found["point"], found["share"]) == (None if point is None else 5, share)
 
