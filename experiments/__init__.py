@@ -1,4 +1,6 @@
-"""One file a command: `python -m experiments.NAME`."""
+"""One file per command: `python -m experiments.NAME`."""
+
+from __future__ import annotations
 
 import atexit
 import contextlib
@@ -6,14 +8,14 @@ import os
 import signal
 import sys
 
-#: Exit status of a command that a signal has stopped, once it has tidied up.
+#: Exit status of a command that was stopped by a signal and has cleaned up.
 exit_status: int | None = None
 
 
 def _leave() -> None:
-    """Ends a stopped process as it is: JAX, stopped while it starts, may crash when it is unloaded.
+    """Ends a stopped process at once: JAX, stopped while it starts, may crash when it unloads.
 
-    Registered before any library, it is called after what they have registered.
+    It is registered before any library's exit functions, so it is called after them.
     """
     if exit_status is not None:
         for stream in (sys.stdout, sys.stderr):
@@ -23,8 +25,8 @@ def _leave() -> None:
 
 
 if sys.argv[0] == "-m":
-    # A command starts, and this is the first of it that runs. Until `console.one_line_errors` there
-    # is nothing that a signal would have to bring to an end: Ctrl-C acts at once, as SIGTERM does.
+    # A command starts here. Until `console.one_line_errors` there is nothing to clean up after a
+    # signal: Ctrl-C acts at once, as SIGTERM does.
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     atexit.register(_leave)

@@ -1,4 +1,4 @@
-"""What the commands share at the edge: arguments, errors in one line, and progress."""
+"""What all commands share: arguments, errors in one line, and progress."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def fail(message: object) -> NoReturn:
 
 @contextlib.contextmanager
 def one_line_usage() -> Iterator[None]:
-    """Brings the box that tyro prints about wrong arguments to its first paragraph, in one line."""
+    """Reduces tyro's boxed usage error to its first paragraph, on one line."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -71,7 +71,7 @@ def parse(command: type[Arguments], arguments: Sequence[str] | None, **options: 
 
 @contextlib.contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Turns warnings, errors of the user (ValueError, OSError) and signals into one line each."""
+    """Reduces warnings, user errors (ValueError, OSError) and signals to one line each."""
     with warnings.catch_warnings(), StopRequest().receiving():
         warnings.showwarning = _show_warning  # type: ignore[assignment]
         try:
@@ -90,9 +90,9 @@ def _show_warning(message: Warning | str, *_: Any) -> None:
 
 
 def check_new_file(path: Path, in_folder: bool = True) -> None:
-    """Fails if there is something at the path of --out or, with `in_folder`, no folder to hold it.
+    """Fails if --out exists or, with `in_folder`, if its folder does not.
 
-    Data are never overwritten; pictures and pages, which are drawn anew at will, are.
+    Data is never overwritten; pictures and pages, which can be drawn again, are.
     """
     if path.exists():
         fail(f"--out {path}: exists")
@@ -101,7 +101,7 @@ def check_new_file(path: Path, in_folder: bool = True) -> None:
 
 
 def check_picture(out: Path) -> None:
-    """Fails unless --out ends in a format that pictures can be written in."""
+    """Fails unless --out ends in a picture format."""
     from tdanet_jax.analysis import drawing
 
     if out.suffix[1:] not in drawing.formats():
@@ -109,7 +109,7 @@ def check_picture(out: Path) -> None:
 
 
 def check_at_most(flag: str, value: int, most: int) -> None:
-    """Fails if a flag's value is above what there is."""
+    """Fails if a flag's value is too large."""
     if value > most:
         fail(f"--{flag} {value}: at most {most}")
 
@@ -123,14 +123,14 @@ def check_positive(**flags: int | Sequence[int]) -> None:
 
 
 class _Figures(ProgressColumn):
-    """The line of figures that changes with every chunk."""
+    """The figures next to the bar."""
 
     def render(self, task: Task) -> Text:
         return Text(str(task.fields.get("figures", "")))
 
 
 def progress_bar(transient: bool) -> Progress:
-    """A bar with share done, figures, time spent and time left; a transient one leaves no trace."""
+    """A bar with the share done, figures, time spent and time left; a transient one disappears."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),
@@ -146,14 +146,14 @@ def progress_bar(transient: bool) -> Progress:
 
 @contextlib.contextmanager
 def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, str], None]]:
-    """Shows progress: `report(share, figures)`, a live bar on a terminal, else a line now and then.
+    """Shows progress with `report(share, figures)`: a live bar on a terminal, otherwise lines.
 
-    Without a terminal the first report, the last, and those in between that come at least ten
-    seconds after the line before are printed, with the time left at the pace since the first.
+    Lines are at least ten seconds apart, except for the first and the last; the time left is
+    estimated from the pace since the first.
 
     Args:
-      title: what is going on.
-      transient: on a terminal, take the bar away at the end.
+      title: the name of the work.
+      transient: on a terminal, remove the bar at the end.
     """
     if console.is_terminal:
         with progress_bar(transient) as bar:

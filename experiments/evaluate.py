@@ -18,14 +18,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from experiments.console import (
-    console,
-    fail,
-    one_line_errors,
-    parse,
-    print_summary,
-    reporter,
-)
+from experiments.console import console, fail, one_line_errors, parse, print_summary, reporter
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.io import files
 
@@ -81,50 +74,44 @@ def main(arguments: list[str] | None = None) -> None:
             fail(f"--word-vectors {command.word_vectors}: a trained run has its own")
         if len(set(command.checkpoint)) < len(command.checkpoint):
             fail("--checkpoint: a run is given twice")
-        config = untrained_config(command)
+        if len(command.checkpoint) > 1 and command.out is None:
+            fail("several checkpoints need --out")
+        config = TrainConfig(
+            split=TrainConfig().split if command.split is None else command.split,
+            validation=command.validation,
+            data=command.data,
+            word_vectors=command.word_vectors,
+            seed=command.seed or 0,
+        )
         config.check()
-        folder = command.out or default_folder(command)
+        kind = f"history-{command.policy}" if command.history else command.policy
+        folder = command.out or (*command.checkpoint, Path("runs"))[0] / kind
         files.check_empty(folder)
-        evaluate(command, config, folder)
+        play(command, config, folder)
 
 
-def default_folder(command: Command) -> Path:
-    """Where to write if nothing is said."""
-    if len(command.checkpoint) > 1:
-        fail("several checkpoints need --out")
-    kind = f"history-{command.policy}" if command.history else command.policy
-    return (command.checkpoint[0] if command.checkpoint else Path("runs")) / kind
+def play(command: Command, config: TrainConfig, folder: Path) -> None:
+    """Plays the episodes and writes the report.
 
-
-def untrained_config(command: Command) -> TrainConfig:
-    """The task and seed of the policies that need no checkpoint."""
-    return TrainConfig(
-        split=TrainConfig().split if command.split is None else command.split,
-        validation=command.validation,
-        data=command.data,
-        word_vectors=command.word_vectors,
-        seed=command.seed or 0,
-    )
-
-
-def evaluate(command: Command, config: TrainConfig, folder: Path) -> None:
-    """Plays the episodes and writes the report."""
-    from tdanet_jax import runs
+    Args:
+      config: rooms, classes and words of a policy that needs no checkpoint.
+    """
+    from tdanet_jax.evaluation.evaluate import evaluate
     from tdanet_jax.training import devices
 
     devices.keep_compiled()
-    chosen = command.checkpoint
-    with contextlib.ExitStack() as shown:
-        several = command.history or len(chosen) > 1
-        results = runs.evaluate(
-            None if not chosen else chosen if several else chosen[0],
+    runs = command.checkpoint
+    several = command.history or len(runs) > 1
+    with reporter("evaluating") if several else contextlib.nullcontext() as show:
+        results = evaluate(
+            runs if several else runs[0] if runs else None,
             command.policy,
             config=config,
             history=command.history,
             data=command.data,
             seed=command.seed,
             out=folder,
-            on_network=shown.enter_context(reporter("evaluating")) if several else None,
+            on_network=show,
         )
     if not several:
         print_summary(results)

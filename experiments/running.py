@@ -1,18 +1,19 @@
-"""What the commands that train share: their flags, and what they print while runs go on."""
+"""What the commands that train share: flags, progress, and stopping."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import signal
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
 from experiments.console import console, parse, print_summary, reporter
-from experiments.signals import StopRequest
+from experiments.signals import Stopped, StopRequest
 from tdanet_jax.config import CONFIG_FILE, PRESETS, TRUST, TrainConfig
 from tdanet_jax.registry import MODELS
 from tdanet_jax.training.callbacks import Callbacks
@@ -54,37 +55,47 @@ def parse_command(arguments: Sequence[str]) -> Command:
     return parse(Command, arguments, default=default, prog="train_zero_shot")
 
 
+@contextlib.contextmanager
+def stoppable(advice: Callable[[], str]) -> Iterator[Reports]:
+    """Inside, SIGTERM or Ctrl-C ends the program: one line of advice, status 128 + signal."""
+    stop = StopRequest()
+    with stop.receiving():
+        try:
+            with contextlib.ExitStack() as shown:
+                yield Reports(stop, shown)
+        except Stopped as stopped:
+            console.print(f"stopped; {advice()}")
+            stopped.answer()
+
+
 class Reports(Callbacks):
-    """Prints what happens, shows progress, and stops the runs on a signal."""
+    """Prints notes and results, shows progress, and stops the runs on a signal."""
 
-    def __init__(self, stop: StopRequest) -> None:
+    def __init__(self, stop: StopRequest, shown: contextlib.ExitStack) -> None:
+        """`shown` holds the progress bar on the screen, if there is one."""
         self._stop = stop
-        self._shown = contextlib.ExitStack()  # the progress bar that is on the screen
+        self._shown = shown
         self._title = ""
-
-    def __enter__(self) -> Reports:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._shown.close()
 
     def _show(self, title: str, share: float, figures: str) -> None:
         if title != self._title:
-            self._shown.close()
-            transient = title == "rooms"
-            self._title = title
-            self._report = self._shown.enter_context(reporter(title, transient))
+            self._clear(title)
+            self._report = self._shown.enter_context(reporter(title, transient=title == "rooms"))
         self._report(share, figures)
+
+    def _clear(self, title: str = "") -> None:
+        """Takes the progress bar away; of several processes, the lead alone prints."""
+        from tdanet_jax.training import devices
+
+        self._shown.close()
+        self._title = title
+        console.quiet = not devices.is_lead()
 
     def on_rooms(self, done: int, total: int) -> None:
         self._show("rooms", done / total, "rebuilt")
 
     def on_note(self, text: str) -> None:
-        from tdanet_jax.training import devices
-
-        self._shown.close()
-        self._title = ""
-        console.quiet = not devices.is_lead()
+        self._clear()
         console.print(text)
 
     def on_rows(self, runs: Sequence[Run], rows: Sequence[Row]) -> None:
@@ -92,8 +103,9 @@ class Reports(Callbacks):
         self._show("training", runs[0].progress, each + figures_of(rows[0]))
 
     def on_results(self, folder: Path, results: Mapping[str, Any]) -> None:
+        self._clear()
         print_summary(results)
-        self.on_note(f"wrote {folder / 'results.md'}")
+        console.print(f"wrote {folder / 'results.md'}")
 
     def should_stop(self) -> bool:
         return self._stop.signal is not None
@@ -101,10 +113,8 @@ class Reports(Callbacks):
     def on_stop(self) -> None:
         self._stop.signal = self._stop.signal or signal.SIGTERM
 
-    @contextlib.contextmanager
-    def shield(self) -> Iterator[None]:
-        with self._stop.deferred():
-            yield
+    def shield(self) -> AbstractContextManager[None]:
+        return self._stop.deferred()
 
 
 def figures_of(row: Row) -> str:

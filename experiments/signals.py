@@ -1,4 +1,4 @@
-"""Stopping on SIGTERM or Ctrl-C: at once, or after what must not be interrupted."""
+"""Stopping on SIGTERM or Ctrl-C: at once, or after work that must not be interrupted."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import FrameType
 from typing import Any, NoReturn
 
 import experiments
 
-#: After which a stop that waits for an import, or was dropped, is tried again.
-SECONDS_OF_A_MOMENT = 0.05
+#: Seconds after which a stop that waits for an import, or was dropped, is raised again.
+RETRY_SECONDS = 0.05
 
 
 class Stopped(KeyboardInterrupt):
-    """SIGTERM or Ctrl-C came; `signal` is its number.
+    """SIGTERM or Ctrl-C was received; `signal` is its number.
 
-    Python drops what is raised while it collects garbage, and some libraries drop what is raised
-    below them. A stop that was dropped, unless it has been answered, is raised again.
+    Python drops exceptions that are raised in garbage collection, and some libraries drop those of
+    their callbacks. A stop that was dropped is raised again until it has been answered.
     """
 
     def __init__(self, number: int, request: StopRequest) -> None:
@@ -40,19 +40,19 @@ class Stopped(KeyboardInterrupt):
 
 
 class StopRequest:
-    """Turns SIGTERM and Ctrl-C into `Stopped`, at once or, inside `deferred`, at its end.
+    """Raises `Stopped` on SIGTERM and Ctrl-C: at once, or at the end of `deferred`.
 
-    While something is imported the first one waits: a library whose import is broken off may crash.
+    During an import the first signal waits: a library whose import is interrupted may crash.
 
     Attributes:
-      signal: the first one's number, until it is answered.
+      signal: number of the first signal, until it is answered.
     """
 
     def __init__(self) -> None:
         self.signal: int | None = None
         self._deferring = False
-        self._imports = 0  # how deep in imports we are anyway
-        self._alarm: Any = None  # whoever else had SIGALRM
+        self._imports = 0  # depth of imports when we began to receive
+        self._alarm: Any = None  # the handler of SIGALRM before ours
         self._asked = False  # whether the timer is ours
 
     @contextlib.contextmanager
@@ -72,7 +72,7 @@ class StopRequest:
 
     @contextlib.contextmanager
     def receiving(self) -> Iterator[None]:
-        """Inside, the signals come here, but for those that are ignored; none to other threads."""
+        """Inside, this handles the signals that are not ignored; does nothing in other threads."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -85,12 +85,12 @@ class StopRequest:
         }
         before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._receive_alarm)
         hook = sys.unraisablehook
-        # What is dropped is told to this hook, and would be printed.
+        # Dropped exceptions go to this hook, which would print them.
         sys.unraisablehook = lambda told: isinstance(told.exc_value, Stopped) or hook(told)
         try:
             yield
         finally:
-            self._deferring = True  # until whoever had the signals before has them again
+            self._deferring = True  # until the previous handlers are back
             if self._asked:
                 signal.setitimer(signal.ITIMER_REAL, 0)
             for number, handler in before.items():
@@ -122,29 +122,17 @@ class StopRequest:
             self._check()
 
     def _stop(self, number: int) -> NoReturn:
-        signal.setitimer(signal.ITIMER_REAL, 0)  # nothing else breaks off the tidying up
+        signal.setitimer(signal.ITIMER_REAL, 0)  # nothing else interrupts the clean-up
         raise Stopped(number, self)
 
     def ask_again(self) -> None:
-        """Has `Stopped` raised in a moment if a signal is unanswered; callable in any thread."""
+        """Raises `Stopped` soon if a signal is unanswered; callable in any thread."""
         if self.signal is not None and not self._deferring:
             self._asked = True
-            signal.setitimer(signal.ITIMER_REAL, SECONDS_OF_A_MOMENT)
+            signal.setitimer(signal.ITIMER_REAL, RETRY_SECONDS)
 
 
 def _imports(frame: FrameType | None) -> int:
-    """How many calls of the import system a frame is in."""
+    """How many calls of the import system are on a frame's stack."""
     stack = traceback.walk_stack(frame)
     return sum(f.f_code.co_filename == "<frozen importlib._bootstrap>" for f, _ in stack)
-
-
-@contextlib.contextmanager
-def stoppable(advice: Callable[[], str]) -> Iterator[StopRequest]:
-    """Inside, SIGTERM or Ctrl-C ends the program: one line of advice, status 128 + signal."""
-    stop = StopRequest()
-    with stop.receiving():
-        try:
-            yield stop
-        except Stopped as stopped:
-            print(f"stopped; {advice()}")
-            stopped.answer()

@@ -2,8 +2,8 @@
 
     python -m experiments.sweep --splits 18/4 14/8 --seeds 0 1 2 --minutes 10 --out runs/sweep
 
-Every further flag is one of the training command and holds for all runs. After an interruption run
-the same command again: finished runs are skipped, the one that was begun continues. Writes a folder
+Every other flag is one of the training command and applies to all runs. After an interruption, run
+the same command again: it skips the finished runs and continues the unfinished one. Writes a folder
 for each run, report.md, report.json and the learning curves into --out.
 """
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import os
 import sys
@@ -30,12 +31,12 @@ from experiments.console import (
     reporter,
 )
 from experiments.running import Command as TrainingCommand
-from experiments.running import Reports, how_to_continue, parse_command
-from experiments.signals import stoppable
+from experiments.running import how_to_continue, parse_command, stoppable
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
 from tdanet_jax.evaluation import sweep, sweep_report
 from tdanet_jax.evaluation.sweep import FinishedRun
 from tdanet_jax.evaluation.sweep_report import Cost
+from tdanet_jax.io import files
 from tdanet_jax.splits import file_name
 
 #: Batches whose inference time is reported.
@@ -49,30 +50,31 @@ OWN = {
     "--split": "--splits",
     "--model": "--models",
     "--seed": "--seeds",
-    "--resume": "the same command again in its place",
+    "--resume": "the same command again instead",
     "--tensorboard": "none",
 }
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Trains several splits, models and seeds; every further flag is one of train_zero_shot."""
+    """Trains several splits, models and seeds; every other flag is one of train_zero_shot."""
 
     out: Path
     """Folder of the sweep: a folder for each run, and the report."""
     splits: tuple[str, ...] = ("18/4",)
-    """Splits to train on: 22/0, 18/4, 14/8, or unseen classes with commas (Mug,Vase,CD,Towel)."""
+    """Splits to train on: 22/0, 18/4, 14/8, or comma-separated unseen classes
+    (Mug,Vase,CD,Towel)."""
     models: tuple[str, ...] = ("tdanet",)
     """Models to train, ablations included; see --model of train_zero_shot."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of each."""
     vmap_seeds: bool = False
-    """Train the seeds of a split and model in one vmapped call; needs a budget in steps. Made for
-    accelerators: on two cores it is slower than one after the other, unless networks are small."""
+    """Train the seeds of a split and model in one vmapped call; needs a budget in steps. For
+    accelerators: on a CPU it is slower than one seed after the other, unless networks are small."""
     report_only: bool = False
-    """Train nothing; report on the runs in --out that are finished, and on --include."""
+    """Train nothing; report on the finished runs in --out and on --include."""
     include: tuple[Path, ...] = ()
-    """FinishedRun runs elsewhere that the report takes in."""
+    """Finished runs elsewhere to include in the report."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -92,7 +94,7 @@ def main(arguments: list[str] | None = None) -> None:
         base = training.run.normalised()
         configs = sweep.plan(base, command.splits, command.models, command.seeds)
         if command.vmap_seeds and (base.episodes is not None or base.minutes is not None):
-            fail("--vmap-seeds needs a budget in --steps: seeds that end apart cannot share a call")
+            fail("--vmap-seeds needs a budget in --steps: all seeds must end together")
         if command.vmap_seeds and training.devices > 1:
             fail("--vmap-seeds and --devices: choose one")
         if os.environ.get("JAX_COORDINATOR_ADDRESS"):
@@ -100,73 +102,57 @@ def main(arguments: list[str] | None = None) -> None:
         check_positive(devices=training.devices)
         included = [sweep.finished(folder) for folder in command.include]
         planned = [] if command.report_only else [command.out / run_name(c) for c in configs]
-        # What cannot stand in one report shows at once, not after hours of training.
+        # Runs that do not fit into one report are refused now, not after hours of training.
         check_alike([*sweep.find(command.out), *included], planned)
         try:
             if not command.report_only:
                 train_all(command, training, configs)
-            with stoppable(lambda: "what is evaluated is kept"):
+            with stoppable(lambda: "finished evaluations are kept"):
                 write_report(command.out, included)
         except SystemExit as stop:
             if isinstance(stop.code, int) and stop.code > SIGNALLED:
-                console.print("the sweep goes on with the same command")
+                console.print("run the same command again to continue the sweep")
             raise
 
 
 def train_all(command: Command, training: TrainingCommand, configs: Sequence[TrainConfig]) -> None:
-    """Trains what is not finished.
+    """Trains the runs that are not finished.
 
     Args:
       training: the flags of the training command.
-      configs: what to train.
+      configs: all runs.
     """
     from tdanet_jax.models.classes import ClassVocabulary
     from tdanet_jax.models.factory import make_model
     from tdanet_jax.task import resolve
     from tdanet_jax.training import devices
+    from tdanet_jax.training.train import train, train_together
 
     devices.connect(training.devices)
     devices.keep_compiled()
-    configs = [resolve(config) for config in configs]
-    folders = [command.out / run_name(config) for config in configs]
-    # All are looked at before the first trains: a clash shows at once, not after hours, and so does
-    # a model that cannot be made.
-    for config in configs:
+    todo = []
+    # A clash, or a model that cannot be made, shows before anything trains.
+    for config in map(resolve, configs):
         make_model(config, ClassVocabulary())
-    states = [sweep.progress(*pair) for pair in zip(folders, configs, strict=True)]
-    todo = [
-        (config, folder)
-        for config, folder, state in zip(configs, folders, states, strict=True)
-        if state != "finished"
-    ]
+        folder = command.out / run_name(config)
+        if sweep.progress(folder, config) != "finished":
+            todo.append((config, folder))
     console.print(f"{len(configs)} runs, {len(configs) - len(todo)} finished, {len(todo)} to train")
-    from tdanet_jax import runs
-
     if command.vmap_seeds:
-        together: dict[tuple[str, str], list[tuple[TrainConfig, Path]]] = {}
-        for config, folder in todo:
-            together.setdefault((config.split, config.model), []).append((config, folder))
-        for members in together.values():
-            with stoppable(lambda: "every seed is saved") as stop, Reports(stop) as reports:
-                runs.train_together(members, reports)
+        for _, members in itertools.groupby(todo, lambda run: (run[0].split, run[0].model)):
+            with stoppable(lambda: "every seed is saved") as reports:
+                train_together([*members], reports)
         return
     for config, folder in todo:
         advice = functools.partial(how_to_continue, folder, config)
+        begun = (folder / CONFIG_FILE).exists()
         with stoppable(advice) as stop, Reports(stop) as reports:
-            runs.train(
-                config,
-                folder,
-                resume=(folder / CONFIG_FILE).exists(),
-                device_count=training.devices,
-                callbacks=reports,
-            )
+            train(config, folder, resume=begun, device_count=training.devices, callbacks=reports)
 
 
 @contextlib.contextmanager
 def alone(out: Path) -> Iterator[None]:
     """Inside, no other process reports in `out`; waits for one that does."""
-    from tdanet_jax.io import files
-
     with contextlib.ExitStack() as locks:
         try:
             locks.enter_context(files.locked(out))
@@ -177,10 +163,9 @@ def alone(out: Path) -> Iterator[None]:
 
 
 def write_report(out: Path, included: Sequence[FinishedRun]) -> None:
-    """Evaluates what is missing, and writes the report on the runs in `out` and on others."""
+    """Evaluates what is missing, and reports on the runs in `out` and on those included."""
     from tdanet_jax.analysis import figures
     from tdanet_jax.evaluation import report
-    from tdanet_jax.io import files
     from tdanet_jax.tools import benchmarking
 
     if not (sweep.find(out) or included):
@@ -213,7 +198,7 @@ def write_report(out: Path, included: Sequence[FinishedRun]) -> None:
 
 
 def check_alike(runs: Sequence[FinishedRun], planned: Sequence[Path] = ()) -> None:
-    """Fails if the runs, and those in folders where they will be, cannot stand in one table."""
+    """Fails if the runs, and those planned, do not fit into one table."""
     folders = [run.folder for run in runs]
     names = [folder.name for folder in (*folders, *(set(planned) - set(folders)))]
     for name in names:
@@ -225,7 +210,7 @@ def check_alike(runs: Sequence[FinishedRun], planned: Sequence[Path] = ()) -> No
 
 
 def costs(runs: Sequence[FinishedRun]) -> dict[str, Cost]:
-    """Parameters and inference time of every network among the runs, on this machine, by label."""
+    """Parameters and inference time on this machine of every network among the runs, by label."""
     from tdanet_jax.task import load_task
     from tdanet_jax.tools import benchmarking
 
@@ -237,11 +222,8 @@ def costs(runs: Sequence[FinishedRun]) -> dict[str, Cost]:
         if network not in measured:
             task = load_task(config)
             rows = {batch: benchmarking.decision_row(task, batch, repeats=5) for batch in BATCHES}
-            measured[network] = Cost(
-                model=config.model,
-                parameters=rows[BATCHES[0]]["parameters"],
-                milliseconds={batch: row["milliseconds"] for batch, row in rows.items()},
-            )
+            milliseconds = {batch: row["milliseconds"] for batch, row in rows.items()}
+            measured[network] = Cost(config.model, rows[BATCHES[0]]["parameters"], milliseconds)
         out.setdefault(label, measured[network])
     return out
 

@@ -17,8 +17,7 @@ import time
 from pathlib import Path
 
 from experiments.console import check_positive, console, fail, one_line_errors
-from experiments.running import Command, Reports, how_to_continue, parse_command, trust
-from experiments.signals import stoppable
+from experiments.running import Command, how_to_continue, parse_command, stoppable, trust
 from tdanet_jax.config import TrainConfig, run_name
 from tdanet_jax.io import files
 
@@ -68,10 +67,10 @@ def default_folder(config: TrainConfig) -> Path:
 
 def run(command: Command, config: TrainConfig, folder: Path) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
-    with stoppable(lambda: how_to_continue(folder, config)) as stop, Reports(stop) as reports:
-        from tdanet_jax import runs
+    with stoppable(lambda: how_to_continue(folder, config)) as reports:
+        from tdanet_jax.training.train import train
 
-        results = runs.train(
+        results = train(
             config,
             folder,
             resume=command.resume is not None,

@@ -14,9 +14,10 @@ from tdanet_jax import _moved
 if TYPE_CHECKING:
     from tdanet_jax.agent import Agent, Decision, Detection, load
     from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
-    from tdanet_jax.runs import evaluate, train
+    from tdanet_jax.evaluation.evaluate import evaluate
     from tdanet_jax.task import make
     from tdanet_jax.training.callbacks import Callbacks
+    from tdanet_jax.training.train import train
 
 __version__ = "0.2.0"
 
@@ -29,10 +30,10 @@ _PUBLIC = {
     "LearnerConfig": "config",
     "NetworkConfig": "config",
     "TrainConfig": "config",
-    "evaluate": "runs",
+    "evaluate": "evaluation.evaluate",
     "load": "agent",
     "make": "task",
-    "train": "runs",
+    "train": "training.train",
 }
 
 __all__ = [

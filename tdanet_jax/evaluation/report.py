@@ -1,4 +1,4 @@
-"""What a run reports: `results.json`, `results.md` and one record per episode."""
+"""The report on an evaluation: `results.json`, `results.md` and one record per episode."""
 
 from __future__ import annotations
 
@@ -27,12 +27,17 @@ from tdanet_jax.splits import GROUPS
 from tdanet_jax.task import Task
 from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS, ROOM_TYPES
 
+#: Episodes and what happened in them, by group ("seen", "unseen").
+Played = Mapping[str, tuple[Episodes, Records]]
+#: Records as named columns of length E.
+Columns = Mapping[str, np.ndarray]
+
 RESULTS_VERSION = 1
 #: What an evaluation writes into its folder; `RESULTS_FILE` comes last.
 RESULTS_FILE, RESULTS_PAGE, EPISODES_FILE = "results.json", "results.md", "episodes.jsonl"
 
-#: Targets with a near-synonym among the classes that no split hides: those of like meaning whose
-#: bundled word vectors have a cosine of at least 0.84.
+#: Targets with a near-synonym among the classes that no split hides: similar in meaning, with a
+#: cosine of at least 0.84 between the bundled word vectors.
 NEAR_SYNONYMS = {
     "Television": ("TVStand",),
     "ArmChair": ("Chair",),
@@ -46,7 +51,7 @@ NEAR_SYNONYMS = {
 
 @dataclasses.dataclass(frozen=True)
 class Provenance:
-    """Where a result comes from; the fields of `results.json` that are not numbers of it.
+    """Where a result comes from: the fields of `results.json` that are not results.
 
     Attributes:
       split, model: what was trained.
@@ -57,7 +62,7 @@ class Provenance:
       data_version: of the scene tables in the evaluation.
       data: file of their rooms, unless they are the bundled ones.
       image: the image that the model is shown, if there is one.
-      sensors: what the agent senses, which the paper's agents do not.
+      sensors: names of the agent's sensors; the paper's agents have none.
     """
 
     split: str
@@ -82,12 +87,14 @@ class Provenance:
         episodes: int = 0,
         updates: int = 0,
     ) -> Provenance:
-        """That of a network with its actions "sample" or "greedy", or of a policy without one.
+        """The provenance of a network's results, or of a policy's without a network.
 
         Args:
+          task: what was played.
           config: the network's run, with the rooms of the evaluation.
-          episodes: training episodes of the network.
-          updates: training updates of the network.
+          policy: "sample" or "greedy" for networks, else the policy's name.
+          evaluation_seed: of the actions sampled in the test episodes.
+          episodes, updates: training episodes and updates of the network.
         """
         network = policy in ("sample", "greedy")
         return cls(
@@ -105,7 +112,7 @@ class Provenance:
         )
 
 
-def columns(tables: SceneTables, episodes: Episodes, records: Records) -> dict[str, np.ndarray]:
+def columns(tables: SceneTables, episodes: Episodes, records: Records) -> Columns:
     """Records as named columns of length E, with names in place of indices."""
     pose = poses.split(episodes.pose)
     rotation, horizon = pose.degrees
@@ -125,8 +132,8 @@ def columns(tables: SceneTables, episodes: Episodes, records: Records) -> dict[s
     }
 
 
-def results(provenance: Provenance, groups: Mapping[str, Mapping[str, np.ndarray]]) -> dict:
-    """The content of `results.json`, from the columns of each group."""
+def _results(provenance: Provenance, groups: Mapping[str, Columns]) -> dict[str, Any]:
+    """The content of `results.json`."""
 
     def by(key: str, names: tuple[str, ...]) -> dict:
         split = {group: grouped(c, key, names) for group, c in groups.items()}
@@ -150,7 +157,7 @@ def results(provenance: Provenance, groups: Mapping[str, Mapping[str, np.ndarray
     }
 
 
-def _summary(column: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+def _summary(column: Columns) -> dict[str, dict[str, Any]]:
     return summarise(*(column[name] for name in ("success", "shortest", "length", "cluster")))
 
 
@@ -169,9 +176,7 @@ def code_version() -> str:
     return tdanet_jax.__version__
 
 
-def episode_rows(
-    group: str, column: Mapping[str, np.ndarray], records: Records
-) -> list[dict[str, Any]]:
+def episode_rows(group: str, column: Columns, records: Records) -> list[dict[str, Any]]:
     """One plain record per episode; L and e as in the paper, both with Done."""
     rows = []
     for i in range(len(records.length)):
@@ -191,42 +196,43 @@ def episode_rows(
     return rows
 
 
-def write(
-    folder: Path,
-    provenance: Provenance,
-    tables: SceneTables,
-    played: Mapping[str, tuple[Episodes, Records]],
-) -> dict:
-    """Writes `results.json`, `results.md` and `episodes.jsonl`; returns the results.
+def results(
+    provenance: Provenance, tables: SceneTables, played: Played, folder: Path | None = None
+) -> dict[str, Any]:
+    """The content of `results.json` from the records of an evaluation.
 
-    The folder is made if need be.
+    Args:
+      provenance: what was evaluated.
+      tables: the rooms.
+      played: the episodes and what happened in them, by group.
+      folder: where to write `results.json`, `results.md` and `episodes.jsonl`; created if need be.
+        None writes nothing.
     """
     groups = {name: columns(tables, *pair) for name, pair in played.items()}
-    out = results(provenance, groups)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_rows(folder, all_rows(tables, played))
-    files.write_text(folder / RESULTS_PAGE, markdown(out, groups))
-    # The last file, and whole: where it is, the others are.
-    files.write_text(folder / RESULTS_FILE, json.dumps(out, indent=2) + "\n")
+    out = _results(provenance, groups)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_rows(folder, all_rows(tables, played))
+        files.write_text(folder / RESULTS_PAGE, markdown(out, groups))
+        # Last and atomically: where it is, the others are complete.
+        files.write_text(folder / RESULTS_FILE, json.dumps(out, indent=2) + "\n")
     return out
 
 
 def write_rows(folder: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Writes `episodes.jsonl`."""
-    with files.replacing(folder / EPISODES_FILE) as fresh, fresh.open("w") as file:
+    with files.replacing(folder / EPISODES_FILE) as path, path.open("w") as file:
         file.writelines(json.dumps(row) + "\n" for row in rows)
 
 
-def all_rows(
-    tables: SceneTables, played: Mapping[str, tuple[Episodes, Records]]
-) -> Iterator[dict[str, Any]]:
-    """The records of every group."""
+def all_rows(tables: SceneTables, played: Played) -> Iterator[dict[str, Any]]:
+    """The records of every group, as plain values."""
     for name, (episodes, records) in played.items():
         yield from episode_rows(name, columns(tables, episodes, records), records)
 
 
-def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarray]]) -> str:
-    """`results.md`: the tables of the paper's form, with the paper's rows beside ours."""
+def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
+    """`results.md`: tables as in the paper, with the paper's rows next to ours."""
     agent = ObservationSpec(sensors=tuple(out["sensors"])).agent_name(out["model"])
     lines = [
         f"# {agent}, split {out['split']}, seed {out['seed']}",
@@ -266,7 +272,7 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Mapping[str, np.ndarra
     return "\n".join(lines) + "\n"
 
 
-def _near_synonyms(column: Mapping[str, np.ndarray]) -> list[str]:
+def _near_synonyms(column: Columns) -> list[str]:
     """Rows for the unseen classes with and without a near-synonym known in training."""
     like = np.isin(column["target"], list(NEAR_SYNONYMS))
     present = sorted(set(column["target"][like].tolist()))

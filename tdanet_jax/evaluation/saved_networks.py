@@ -87,7 +87,7 @@ class Evaluated:
             "share": None if point is None else point / max(self.saved.config.history, 1),
             "updates": self.snapshot.updates,
             "training_seconds": round(self.snapshot.seconds, 1),
-            **report.results(self.provenance, self.columns()),
+            **report.results(self.provenance, self.task.tables, self.played),
             "settings": comparison.settings(self.saved.config),
         }
 

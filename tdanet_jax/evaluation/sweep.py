@@ -1,7 +1,7 @@
 """A sweep: runs of several splits, models and seeds in one folder.
 
-A run's folder tells how far it is: nothing yet, begun (there is a `config.json`), or finished
-(there is a `results.json`, which is written last). So an interrupted sweep goes on where it was.
+A run's folder shows how far it is: new, begun (it has a `config.json`), or finished (it has a
+`results.json`, which is written last). So an interrupted sweep continues where it was.
 """
 
 from __future__ import annotations
@@ -27,7 +27,11 @@ HISTORIES = "histories"
 def plan(
     base: TrainConfig, splits: Sequence[str], models: Sequence[str], seeds: Sequence[int]
 ) -> list[TrainConfig]:
-    """The configurations of a sweep, seeds of one split and model together.
+    """The configurations of a sweep; the seeds of one split and model follow one another.
+
+    Args:
+      base: all other settings.
+      splits, models, seeds: the values to combine.
 
     Raises:
       ValueError: a value is not allowed or given twice; the message names the flag.
@@ -53,7 +57,8 @@ def progress(folder: Path, config: TrainConfig) -> Literal["new", "begun", "fini
     """How far the run of a configuration is.
 
     Args:
-      config: as it runs, with no `auto` left (`task.resolve`).
+      folder: the run's.
+      config: the run, with every "auto" resolved (`task.resolve`).
 
     Raises:
       ValueError: the folder holds a run of another configuration; the message names the flags.
@@ -68,7 +73,7 @@ def progress(folder: Path, config: TrainConfig) -> Literal["new", "begun", "fini
     if differing:
         raise ValueError(
             f"{folder}: trained with other values of {', '.join(differing)}; "
-            "choose another --out, or the flags of before"
+            "choose another --out, or the same flags as before"
         )
     return "finished" if (folder / RESULTS_FILE).exists() else "begun"
 
@@ -78,10 +83,10 @@ class FinishedRun:
     """A finished run.
 
     Attributes:
-      folder: where it is.
-      config: what was trained.
+      folder: its folder.
+      config: its configuration.
       results: the content of its `results.json`, and its settings.
-      seconds: training time; None if nothing says.
+      seconds: training time; None if unknown.
     """
 
     folder: Path
@@ -91,10 +96,10 @@ class FinishedRun:
 
 
 def finished(folder: Path) -> FinishedRun:
-    """A finished run.
+    """The finished run in a folder.
 
     Raises:
-      ValueError: the folder holds none; the message names it.
+      ValueError: there is none; the message names the folder.
     """
     from tdanet_jax.evaluation.report import RESULTS_FILE
     from tdanet_jax.training.journal import METRICS_FILE, read_metrics
@@ -113,7 +118,7 @@ def finished(folder: Path) -> FinishedRun:
     return FinishedRun(folder, config, results, rows[-1]["seconds"] if rows else None)
 
 
-#: What a report reads in a `results.json`, beside the rates of groups.
+#: What a report reads in a `results.json`, in addition to the groups' results.
 _READ = (
     "split", "model", "policy", "seed", "data_version", "episodes_trained", "steps", "by_room"
 )  # fmt: skip
@@ -125,7 +130,7 @@ def find(out: Path) -> list[FinishedRun]:
 
 
 def find_others(out: Path) -> list[Path]:
-    """Folders of results there that are no runs, say of a policy without training."""
+    """Folders with results that are not runs, for example of the random policy."""
     return [path for path in _with_results(out) if not (path / CONFIG_FILE).exists()]
 
 
@@ -136,15 +141,15 @@ def _with_results(out: Path) -> list[Path]:
 
 
 def labels(runs: Sequence[FinishedRun]) -> list[str]:
-    """What the report calls each run: those that differ in the seed alone share a name."""
+    """A label for each run; runs that differ only in the seed share one."""
     return comparison.labels([run.results for run in runs], [run.folder.name for run in runs])
 
 
 def histories(runs: Sequence[FinishedRun], out: Path) -> Iterator[tuple[FinishedRun, int]]:
     """Evaluates the histories that are not evaluated yet, into `out`/histories/<run>.json.
 
-    Actions are sampled with each run's own seed: the end of its budget gives its results again.
-    Yields a run and the points of it that are done, after each point.
+    Actions are sampled with each run's own seed, so that its last point has the run's results.
+    Yields, after each point, its run and how many of the run's points are done.
 
     Raises:
       ValueError: a point cannot be read, or belongs to other rooms.
@@ -170,7 +175,7 @@ def histories(runs: Sequence[FinishedRun], out: Path) -> Iterator[tuple[Finished
 
 
 def evaluated_history(run: FinishedRun, out: Path) -> list[Result] | None:
-    """The results of a run's history, or None if it is not evaluated as it is now."""
+    """The results of a run's history; None if it has not been evaluated, or has changed since."""
     path = out / HISTORIES / f"{run.folder.name}.json"
     if not path.exists():
         return None
@@ -178,12 +183,12 @@ def evaluated_history(run: FinishedRun, out: Path) -> list[Result] | None:
         kept = json.loads(path.read_text())
         of, results = kept["of"], kept["results"]
     except (ValueError, KeyError, TypeError):
-        return None  # it is evaluated anew
+        return None
     return results if of == _fingerprint(run) else None
 
 
 def _fingerprint(run: FinishedRun) -> str:
-    """Another one for another configuration, other rooms or other networks in its history."""
+    """Changes with the configuration, the rooms and the networks of the history."""
     from tdanet_jax.training import history
 
     points = {path.name: history.checksums(path) for path in history.points(run.folder)}
@@ -193,16 +198,7 @@ def _fingerprint(run: FinishedRun) -> str:
 
 def untrained(runs: Sequence[FinishedRun], seed: int) -> list[Result]:
     """Results of random actions and of the shortest path on the splits of the runs."""
-    from tdanet_jax.evaluation import episodes, policies, report, rollout
-    from tdanet_jax.task import load_task
+    from tdanet_jax.evaluation.evaluate import UNTRAINED, evaluate
 
-    out: list[Result] = []
-    for config in {run.results["split"]: run.config for run in runs}.values():
-        task = load_task(config)
-        lists = episodes.load(task.tables, task.split, task.extras)
-        for name, make in (("random", policies.random), ("shortest_path", policies.shortest_path)):
-            played = rollout.evaluate_lists(make(), None, task.eval_params, lists, seed)
-            provenance = report.Provenance.of(task, config, name, seed)
-            groups = {group: report.columns(task.tables, *pair) for group, pair in played.items()}
-            out.append(report.results(provenance, groups))
-    return out
+    splits = {run.results["split"]: run.config for run in runs}.values()
+    return [evaluate(policy=n, config=config, seed=seed) for config in splits for n in UNTRAINED]

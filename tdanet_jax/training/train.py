@@ -1,45 +1,61 @@
-"""The training loop: a run in its folder, from its first update to the end of its budget."""
+"""Training: a run in its folder, from its first update to its results in the test rooms."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
+
+import jax
 
 from tdanet_jax import config as configs
+from tdanet_jax.analysis import figures
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.evaluation import episodes, policies, report, rollout
 from tdanet_jax.io import files
 from tdanet_jax.models.factory import unused_flags
 from tdanet_jax.task import Task, load_task, resolve
 from tdanet_jax.training import checkpoint, devices
 from tdanet_jax.training.callbacks import Callbacks
-from tdanet_jax.training.journal import Row, tensorboard_sink
+from tdanet_jax.training.journal import Row, read_metrics, tensorboard_sink
 from tdanet_jax.training.run import Run, chunks_together
-
-Result = TypeVar("Result")
 
 
 def train(
     config: TrainConfig | None,
-    folder: Path,
-    then: Callable[[Run], Result],
+    folder: Path | str,
     *,
     resume: bool = False,
     device_count: int = 1,
     tensorboard: bool = False,
-    callbacks: Callbacks,
-) -> Result | None:
-    """Trains a run to the end of its budget; see `tdanet_jax.runs.train`.
+    callbacks: Callbacks | None = None,
+) -> dict[str, Any] | None:
+    """Trains a run to the end of its budget, evaluates it in the test rooms, and writes its report.
 
     Args:
-      then: called with the finished run while its folder is still locked; its result is returned.
+      config: the run. With `resume`, only its budget counts, as the run's new one; None keeps the
+        run's own.
+      folder: where everything is written; new or empty, unless `resume`.
+      resume: continue the run in `folder` from its newest checkpoint, bit for bit.
+      device_count: devices to split the environments over, in this process.
+      tensorboard: also write TensorBoard events (needs tensorboardX).
+      callbacks: progress, and a way to stop.
+
+    Returns:
+      The content of `results.json`; None if the run was stopped early, and in every process of a
+      distributed run but the lead.
+
+    Raises:
+      ValueError: a value of the configuration, the folder or a file is not as it must be, or too
+        many updates were not finite; one line that names it.
     """
+    folder, callbacks = Path(folder), callbacks or Callbacks()
     if resume:
         config = resumed(folder, config)
+    elif config is None:
+        raise ValueError("a new run needs a configuration")
     else:
-        if config is None:
-            raise ValueError("a new run needs a configuration")
         config.check()
         config = config.normalised()
     mesh = devices.connect(device_count)
@@ -51,44 +67,39 @@ def train(
     config = resolve(config)
     with files.locked(folder) if devices.is_lead() else contextlib.nullcontext():
         if devices.is_lead():
-            prepare(folder, config, task, resume, callbacks)
+            _prepare(folder, config, task, resume, callbacks)
         devices.wait_for_all("the folder is there")
         with callbacks.shield():
             run = Run(folder, config, task, mesh)
         devices.wait_for_all("the run is loaded")  # before anyone writes
         callbacks.on_note(f"{run.title} -> {folder}")
         sink = tensorboard_sink(folder) if tensorboard and devices.is_lead() else None
-        if not learn([run], ([row] for row in run.chunks()), callbacks, sink):
-            return None
-        return then(run) if devices.is_lead() else None
+        finished = _learn([run], ([row] for row in run.chunks()), callbacks, sink)
+        return _report(run, callbacks) if finished and devices.is_lead() else None
 
 
-def train_together(
-    members: Sequence[tuple[TrainConfig, Path]],
-    then: Callable[[Run], Any],
-    callbacks: Callbacks,
-) -> None:
-    """Trains seeds of one configuration in one vmapped call.
+def train_together(members: Sequence[tuple[TrainConfig, Path]], callbacks: Callbacks) -> None:
+    """Trains seeds of one configuration in one vmapped call, and reports on each.
 
     Args:
       members: configurations that differ in their seed alone, and their folders, new or begun.
-      then: called with each run at the end of the budget; not if they are stopped early.
+      callbacks: progress, and a way to stop.
     """
     with contextlib.ExitStack() as locks:
         task = load_task(members[0][0], callbacks.on_rooms)
         runs = []
         for config, folder in members:
             locks.enter_context(files.locked(folder))
-            prepare(folder, config, task, (folder / CONFIG_FILE).exists(), callbacks)
+            _prepare(folder, config, task, (folder / CONFIG_FILE).exists(), callbacks)
             runs.append(Run(folder, config, task))
             callbacks.on_note(f"{runs[-1].title} -> {folder}")
-        if learn(runs, chunks_together(runs), callbacks):
+        if _learn(runs, chunks_together(runs), callbacks):
             for run in runs:
-                then(run)
+                _report(run, callbacks)
 
 
 def resumed(folder: Path, budget: TrainConfig | None = None) -> TrainConfig:
-    """The configuration of the run in a folder, with a new budget if one is given.
+    """The configuration of the run in a folder, with the budget of another if that has one.
 
     Raises:
       ValueError: the folder holds no run, or nothing to continue from.
@@ -96,16 +107,16 @@ def resumed(folder: Path, budget: TrainConfig | None = None) -> TrainConfig:
     config = configs.load(folder / CONFIG_FILE)
     if checkpoint.is_shared(folder):
         raise ValueError(f"--resume {folder}: a shared agent; there is nothing to continue from")
-    if budget is not None and any(getattr(budget, name) is not None for name in configs.BUDGETS):
+    if budget is not None and budget.has_budget:
         config = config.with_budget(budget)
         config.check()
     return config
 
 
-def prepare(
+def _prepare(
     folder: Path, config: TrainConfig, task: Task, resume: bool, callbacks: Callbacks
 ) -> None:
-    """Leaves in a run's folder what a run begins with."""
+    """Writes what a run's folder holds from the start."""
     if not resume:
         files.check_empty(folder, f" (to continue there: --resume {folder})")
     for path in files.remove_partial(folder) + files.remove_partial(folder / checkpoint.FOLDER):
@@ -114,14 +125,10 @@ def prepare(
     task.classes.save(folder)
 
 
-def learn(
+def _learn(
     runs: Sequence[Run], chunks: Iterator[list[Row]], callbacks: Callbacks, sink: Any = None
 ) -> bool:
-    """Trains to the end of the budget, with checkpoints; saves in the end.
-
-    Returns:
-      Whether it came to the end of the budget: False if a process stops it.
-    """
+    """Trains and saves; returns False if a process has stopped it before the budget's end."""
 
     def save() -> float:
         for run in runs:
@@ -143,3 +150,20 @@ def learn(
                 saved = save()
         save()
     return True
+
+
+def _report(run: Run, callbacks: Callbacks) -> dict[str, Any]:
+    """Evaluates a finished run; writes its learning curve and its results."""
+    figures.learning_curve(read_metrics(run.folder), run.title, run.folder / "learning_curve.png")
+    callbacks.on_note("evaluating ...")
+    task, seed = run.task, run.config.seed
+    lists = episodes.load(task.tables, task.split, task.extras)
+    policy = policies.network(run.model, task.words)
+    weights = jax.device_get(run.state.params)
+    played = rollout.evaluate_lists(policy, weights, task.eval_params, lists, seed)
+    provenance = report.Provenance.of(
+        task, run.config, "sample", seed, int(run.state.episodes), int(run.state.updates)
+    )
+    results = report.results(provenance, task.tables, played, run.folder)
+    callbacks.on_results(run.folder, results)
+    return results

@@ -1,4 +1,4 @@
-"""The shape of results.json, the records beside it, and the page."""
+"""The shape of results.json, the records next to it, and the page."""
 
 import dataclasses
 import json
@@ -14,8 +14,8 @@ from tdanet_jax.vocabulary import ALL_TARGETS
 BUCKET = {"SR", "SPL", "SR_ci", "SPL_ci", "n"}
 TOP = [
     "version", "split", "model", "policy", "episodes_trained", "seen", "unseen", "by_room",
-    "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "odometry",
-    "triangulation", "commit",
+    "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "sensors",
+    "odometry", "triangulation", "commit",
 ]  # fmt: skip
 
 
@@ -40,7 +40,7 @@ def played(ithor):
 @pytest.fixture
 def written(played, ithor, tmp_path):
     provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 7, 200, ithor.data_version)
-    return tmp_path, report.write(tmp_path, provenance, ithor, played)
+    return tmp_path, report.results(provenance, ithor, played, tmp_path)
 
 
 def test_results_have_the_documented_shape(written):
@@ -58,7 +58,7 @@ def test_the_report_says_how_it_can_be_made_again(played, ithor, tmp_path):
     shown = report.Provenance(
         "18/4", "savn", "sample", 1, 0, 7, 2, ithor.data_version, "rooms.npz", "a map"
     )
-    out = report.write(tmp_path, shown, ithor, played)
+    out = report.results(shown, ithor, played, tmp_path)
     names = ("seed", "evaluation_seed", "data", "image")
     assert [out[name] for name in names] == [0, 7, "rooms.npz", "a map"]
     page = (tmp_path / "results.md").read_text()
@@ -66,27 +66,26 @@ def test_the_report_says_how_it_can_be_made_again(played, ithor, tmp_path):
     assert "\nData: rooms.npz.\nImage: a map.\n" in page
 
 
-def test_the_report_says_that_an_agent_senses_more_than_the_papers(played, ithor, tmp_path):
-    shown = report.Provenance(
-        "18/4", "tdanet", "sample", 1, 0, 7, 2, ithor.data_version, odometry=True
-    )
-    for sights, name in (
-        (False, "tdanet, --odometry"),
-        (True, "tdanet, --odometry, --triangulation"),
+def test_the_report_names_the_sensors(played, ithor, tmp_path):
+    shown = report.Provenance("18/4", "tdanet", "sample", 1, 0, 7, 2, ithor.data_version)
+    for sensors, name in (
+        (("odometry",), "tdanet, --odometry"),
+        (("odometry", "triangulation"), "tdanet, --odometry, --triangulation"),
+        (("my_lab.compass",), "tdanet, --sensors my_lab.compass"),
     ):
-        shown = dataclasses.replace(shown, triangulation=sights)
-        out = report.write(tmp_path, shown, ithor, played)
-        assert (out["odometry"], out["triangulation"]) == (True, sights)
+        shown = dataclasses.replace(shown, sensors=sensors)
+        out = report.results(shown, ithor, played, tmp_path)
+        assert out["sensors"] == list(sensors)
+        for flag in ("odometry", "triangulation"):
+            assert out[flag] == (flag in sensors)
         page = (tmp_path / "results.md").read_text()
         assert page.startswith(f"# {name}, split 18/4")
         assert f"| **{name} (ours)** |" in page
-        assert report.agent_name("tdanet", True, sights) == name
-    assert report.agent_name("tdanet", False, False) == "tdanet"
 
 
 def test_a_folder_that_is_not_there_is_made(played, ithor, tmp_path):
     shown = report.Provenance("18/4", "tdanet", "sample", 10, 3, 7, 200, ithor.data_version)
-    report.write(tmp_path / "one" / "two", shown, ithor, played)
+    report.results(shown, ithor, played, tmp_path / "one" / "two")
     assert sorted(path.name for path in (tmp_path / "one" / "two").iterdir()) == [
         "episodes.jsonl", "results.json", "results.md"
     ]  # fmt: skip
@@ -127,7 +126,7 @@ def test_unseen_classes_with_a_near_synonym_are_reported_apart(ithor, tmp_path):
     records = Records(np.array([3, 3]), np.array([3, 3]), np.array([True, False]), actions)
     provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 7, 200, ithor.data_version)
     played = {"seen": (episodes, records), "unseen": (episodes, records)}
-    report.write(tmp_path, provenance, ithor, played)
+    report.results(provenance, ithor, played, tmp_path)
     page = (tmp_path / "results.md").read_text()
     assert "| unseen | ToiletPaper | 100.0 (100.0 to 100.0) |" in page
     assert "| unseen | without ToiletPaper | 0.0 (0.0 to 0.0) |" in page

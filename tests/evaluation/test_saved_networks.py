@@ -60,10 +60,10 @@ def test_the_agent_of_the_project_plays_in_the_rooms_of_the_project(ithor: Scene
     assert decision(BUNDLED).sum() == pytest.approx(1.0)
 
 
-def test_training_does_not_begin_anew_where_an_agent_was_passed_on(
+def test_a_shared_agent_is_not_resumed(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with pytest.raises(SystemExit):
         train(["--resume", str(BUNDLED)])
-    assert "there is nothing to go on from" in capsys.readouterr().err
+    assert "there is nothing to continue from" in capsys.readouterr().err
     assert newest(BUNDLED).updates

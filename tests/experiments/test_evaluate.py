@@ -10,10 +10,12 @@ from types import SimpleNamespace
 import jax
 import pytest
 
+import tdanet_jax
 from experiments import evaluate
 from tdanet_jax import config as configs
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.evaluation import report, saved_networks
+from tdanet_jax.evaluation.evaluate import short_names
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
 from tdanet_jax.io.files import check_empty
 from tdanet_jax.task import make_task
@@ -148,7 +150,7 @@ def test_a_run_is_evaluated_in_rooms_of_a_file(
     assert not (tmp_path / "here").exists()
 
 
-def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch, capsys):
+def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch):
     """Files appear whole or not at all: the same command works again."""
 
     class Done:
@@ -163,13 +165,14 @@ def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch, capsys):
         def columns(self):
             return {}
 
+    monkeypatch.setattr(saved_networks, "find", lambda run, with_history, data: [Done.saved])
     monkeypatch.setattr(saved_networks, "evaluate", lambda networks, greedy, seed: [Done()])
     monkeypatch.setattr(report, "all_rows", lambda tables, played: 1000 * [{"group": "seen"}])
-    command, out = evaluate.Command(checkpoint=(tmp_path / "a",)), tmp_path / "out"
+    out = tmp_path / "out"
     with pytest.raises(OSError, match="File too large"), full_disk(5000):
-        evaluate.evaluate_several(command, [Done.saved], out)
+        tdanet_jax.evaluate([tmp_path / "a"], out=out)
     check_empty(out)
-    evaluate.evaluate_several(command, [Done.saved], out)
+    tdanet_jax.evaluate([tmp_path / "a"], out=out)
     assert json.loads((out / "evaluations.json").read_text()) == [made_up() | {"difference": None}]
     assert len((out / "episodes.jsonl").read_text().splitlines()) == 1000
 
@@ -191,7 +194,7 @@ def test_only_a_point_of_a_history_has_a_share_of_the_budget(tmp_path, point, sh
     snapshot = Snapshot(None, 40, 100, 1.0, 0 if point is None else 5, "d")
     provenance = report.Provenance("18/4", "tdanet", "sample", 100, 0, 0, 1600, "d")
     done = saved_networks.Evaluated(
-        SavedNetwork(tmp_path, TINY, point), snapshot, None, provenance, {}
+        SavedNetwork(tmp_path, TINY, point), snapshot, SimpleNamespace(tables=None), provenance, {}
     )
     found = done.results()
     assert (found["point"], found["share"]) == (None if point is None else 5, share)
@@ -199,7 +202,7 @@ def test_only_a_point_of_a_history_has_a_share_of_the_budget(tmp_path, point, sh
 
 def test_runs_of_folders_that_are_called_alike_have_their_paths_for_names():
     a, b, other = Path("x/run"), Path("y/run"), Path("x/other")
-    assert evaluate.short_names([a, b, other]) == {a: "x/run", b: "y/run", other: "other"}
+    assert short_names([a, b, other]) == {a: "x/run", b: "y/run", other: "other"}
 
 
 def test_a_run_without_history_is_named(runs, capsys, tmp_path):

@@ -50,7 +50,7 @@ def test_it_trains_evaluates_and_goes_on_after_kill_and_term(ithor, tmp_path, ca
     assert process.returncode == 128 + signal.SIGTERM
     assert "half-written when the run was stopped" in said
     assert (
-        f"updates are saved; go on with: python -m experiments.train_zero_shot --resume {out}"
+        f"updates are saved; continue with: python -m experiments.train_zero_shot --resume {out}"
         in said
     )
     assert not (out / "results.json").exists()
@@ -98,7 +98,7 @@ SENSES = ("--odometry", "--triangulation")
 
 
 def test_two_processes_train_together_and_one_goes_on_alone(ithor, tmp_path):
-    """The environments of one run in two processes; what they saved, one process goes on with.
+    """The environments of one run in two processes; one process continues from what they saved.
 
     With odometry and triangulation: every environment has a map of its own.
     """

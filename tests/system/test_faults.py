@@ -24,12 +24,12 @@ import pytest
 
 from experiments import evaluate as evaluating
 from experiments import train_zero_shot
-from tdanet_jax import task
 from tdanet_jax.evaluation import rollout
 from tdanet_jax.io import assets, files
 from tdanet_jax.scenes import cache
+from tdanet_jax.training import train as training
 from tdanet_jax.training.checkpoint import Checkpoints
-from tdanet_jax.training.journal import METRICS_FILE, Journal, read_metrics
+from tdanet_jax.training.journal import METRICS_FILE, Journal, read_metrics, tensorboard_sink
 from tdanet_jax.training.run import Run
 from tests.support import command
 from tests.training.test_checkpoint import flip, halve
@@ -119,7 +119,7 @@ def test_a_disk_that_is_full_stops_the_run_before_it_loses_anything(
     with monkeypatch.context() as patch:
         patch.setattr(Checkpoints, "save", save_in_full)
         assert ends(*SHORT, "--out", out) == 2
-    monkeypatch.setattr(train_zero_shot, "report_on", lambda *_: None)  # to save time
+    monkeypatch.setattr(training, "_report", lambda *_: None)  # to save time
     line = said_error(capsys)
     assert line.startswith(f"error: {out}/checkpoints/{updates}: checkpoint not written (")
     assert line.endswith(f"; {left}")
@@ -151,11 +151,11 @@ def test_a_signal_in_any_phase_ends_in_one_line_and_the_run_goes_on(
 ) -> None:
     out = tmp_path / "run"
     phases: list[tuple[Any, str, str]] = [
-        (task, "load_task", "stopped; the run had not begun"),
-        (Run, "_begin", "stopped; 0 updates are saved; go on with: "),
-        (Run, "_compile", "stopped; 10 updates are saved; go on with: "),
-        (Checkpoints, "save", "stopped; 20 updates are saved; go on with: "),
-        (rollout, "evaluate_lists", "stopped; 30 updates are saved; go on with: "),
+        (training, "load_task", "stopped; the run had not begun"),
+        (Run, "_begin", "stopped; 0 updates are saved; continue with: "),
+        (Run, "_compile", "stopped; 10 updates are saved; continue with: "),
+        (Checkpoints, "save", "stopped; 20 updates are saved; continue with: "),
+        (rollout, "evaluate_lists", "stopped; 30 updates are saved; continue with: "),
     ]
     for number, (place, name, message) in enumerate(phases):
         sent = (signal.SIGTERM, signal.SIGINT)[number % 2]
@@ -249,7 +249,7 @@ def test_a_command_without_standard_output_is_stopped_in_one_line(tmp_path: Path
 def test_a_signal_ends_any_command_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, sent: int
 ) -> None:
-    monkeypatch.setattr(evaluating, "evaluate_untrained", lambda *_: os.kill(os.getpid(), sent))
+    monkeypatch.setattr(evaluating, "play", lambda *_: os.kill(os.getpid(), sent))
     with pytest.raises(SystemExit) as stopped:
         evaluating.main(["--policy", "random", "--out", str(tmp_path / "out")])
     assert stopped.value.code == 128 + sent
@@ -300,9 +300,9 @@ def events(folder: Path) -> list[tuple[int, str, float]]:
 
 
 def test_tensorboard_gets_every_figure(tmp_path: Path) -> None:
-    with train_zero_shot.metrics_sink(tmp_path, tensorboard=True) as sink:
-        sink(row(1))
-        sink(row(2))
+    sink = tensorboard_sink(tmp_path)
+    sink(row(1))
+    sink(row(2))
     found = events(tmp_path / "tensorboard")
     assert found == [
         (40, "train/updates", 1.0), (40, "train/success", 0.5), (80, "train/updates", 2.0),
@@ -311,10 +311,8 @@ def test_tensorboard_gets_every_figure(tmp_path: Path) -> None:
 
 
 def test_training_goes_on_without_tensorboard(tmp_path: Path) -> None:
-    with (
-        train_zero_shot.metrics_sink(tmp_path, tensorboard=True) as sink,
-        warnings.catch_warnings(record=True) as caught,
-    ):
+    sink = tensorboard_sink(tmp_path)
+    with warnings.catch_warnings(record=True) as caught:
         sink(row(1))
         with full_disk(300):
             for number in range(2, 40):  # more than any queue would hold

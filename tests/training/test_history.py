@@ -64,10 +64,10 @@ def test_a_missing_file_and_one_of_something_else_are_named(tmp_path):
 
 
 def test_a_newer_format_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(history, "FORMAT", 2)
+    monkeypatch.setattr(history, "FORMAT", history.FORMAT + 1)
     path = history.write(tmp_path, SNAPSHOT)
     monkeypatch.undo()
-    with pytest.raises(ValueError, match="format 2, this version reads 1"):
+    with pytest.raises(ValueError, match="format 3, this version reads 2"):
         history.read(path)
 
 
