@@ -145,9 +145,9 @@ def train_all(command: Command, training: TrainingCommand, configs: Sequence[Tra
         return
     for config, folder in todo:
         advice = functools.partial(how_to_continue, folder, config)
-        begun = (folder / CONFIG_FILE).exists()
-        with stoppable(advice) as stop, Reports(stop) as reports:
-            train(config, folder, resume=begun, device_count=training.devices, callbacks=reports)
+        resume, count = (folder / CONFIG_FILE).exists(), training.devices
+        with stoppable(advice) as reports:
+            train(config, folder, resume=resume, device_count=count, callbacks=reports)
 
 
 @contextlib.contextmanager

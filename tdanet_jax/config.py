@@ -1,4 +1,4 @@
-"""Everything that can be set on a training run, as frozen dataclasses. Imports no JAX."""
+"""All settings of a training run, as frozen dataclasses. Imports no JAX."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -16,9 +16,9 @@ from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.registry import MODELS, SENSORS
 from tdanet_jax.splits import file_name, make_split, split_name
 
-#: Budget in environment steps where none is given.
+#: Environment steps of a run without a budget.
 DEFAULT_STEPS = 12_000_000
-#: What a run's budget can be given in; it ends when one of those given is spent.
+#: Units of a run's budget; if several are given, training stops when the first runs out.
 BUDGETS = ("steps", "episodes", "minutes")
 #: Name of the file in a run's folder that holds its configuration.
 CONFIG_FILE = "config.json"
@@ -29,66 +29,65 @@ TRUST = "TDANET_TRUST"
 
 @dataclasses.dataclass(frozen=True)
 class LearnerConfig:
-    """The update's constants. The reference's own are those of `--preset paper`."""
+    """The update's hyperparameters; `--preset paper` has those of the reference implementation."""
 
     num_envs: int = 256
     """Environments that step together (B)."""
     rollout_steps: int = 20
     """Actions per environment and update (T)."""
     learning_rate: float = 5e-4
-    """Adam's step size at the start."""
+    """Adam's initial learning rate."""
     final_learning_rate: float = 0.0
-    """Adam's step size at the end of the budget; falls linearly."""
+    """Learning rate at the end of the budget; decays linearly."""
     amsgrad: bool = False
-    """AMSGrad in place of Adam, as in the reference."""
+    """AMSGrad instead of Adam, as in the reference."""
     adam_epsilon: float = 1e-8
-    """Added to Adam's denominator."""
+    """Term added to Adam's denominator."""
     max_grad_norm: float = 0.5
-    """Gradients are scaled down to this norm."""
+    """Gradients are clipped to this global norm."""
     gamma: float = 0.99
-    """Discount per action."""
+    """Discount factor per action."""
     gae_lambda: float = 0.95
-    """GAE's lambda; the reference's tau is 1."""
+    """Lambda of generalised advantage estimation; the reference's tau is 1."""
     entropy_weight: float = 0.01
-    """Weight of the policy's entropy (nats) in the loss, at the start."""
+    """Initial weight of the policy's entropy (nats) in the loss."""
     final_entropy_weight: float = 0.01
     """Weight of the entropy at the end of the budget; changes linearly."""
     value_weight: float = 0.5
-    """Weight of the squared error of the values."""
+    """Weight of the value loss, the squared error."""
     step_limit: int = 50
     """Actions after which a training episode is truncated."""
     partial_reward: Literal["parents", "similarity", "none"] = "parents"
-    """What earns something before the target is found. parents: the sight of a parent of the target
-    (Eq. 3). similarity: 0.1 times the cosine between the word vectors of the target and of a class
-    in view, when it is the largest of the episode so far (SSNet). none: nothing."""
+    """Reward before the target is found. parents: for seeing a parent of the target (Eq. 3).
+    similarity: 0.1 times the cosine between the word vectors of the target and of a class in view,
+    whenever it is the largest of the episode so far (SSNet). none: no such reward."""
     size_noise: float = 0.0
-    """In each training episode the sides of the target's boxes are multiplied by another factor,
-    between e^-x and e^x, so that the agent does not rely on how large things are. Beyond the
-    paper."""
+    """Augmentation: scales the target's box sides by a per-episode factor, log-uniform in
+    [e^-x, e^x], so that the policy cannot rely on apparent size. Not in the paper."""
     bootstrap_truncated: bool = True
-    """Values the state in which a time-out cut an episode; False takes it for an end, as the
-    reference does."""
+    """Bootstrap the return from the last state's value when an episode times out. False treats a
+    time-out as termination, as the reference does."""
 
 
 @dataclasses.dataclass(frozen=True)
 class NetworkConfig:
-    """The network and what it is shown."""
+    """The network, and what it is shown."""
 
     width: int = 512
-    """Units of every layer of the encoder."""
+    """Units of each layer of the encoder."""
     hidden: int = 512
     """Units of the LSTM."""
     dropout: float = 0.0
-    """Share of the Siamese difference that is dropped in training. The paper's is 0.25; on
-    validation it changed nothing but the speed."""
+    """Dropout rate of the Siamese difference in training. The paper's is 0.25, which changed only
+    the speed on validation."""
     rows: Literal["class", "object"] = "object"
-    """One detection per object, as in the paper, or per class (extent over its instances), as in
-    the code of MJOLNIR and SSNet. Per object did better on validation."""
+    """One detection per object, as in the paper, or one per class (the extent of its instances), as
+    in the code of MJOLNIR and SSNet. Per object did better on validation."""
     word_norm: float = 3.0
-    """Length that every word vector is scaled to."""
+    """Norm to which all word vectors are scaled."""
     image: Literal["auto", "raster", "features"] = "auto"
-    """What models that look at an image see: the classes of 7 x 7 cells, or the feature maps of
-    ResNet-18 that were imported beside --data. auto: the maps where there are any."""
+    """Image of the models that look at one. raster: the class in each of 7 x 7 cells. features:
+    ResNet-18's feature maps, imported with the rooms of --data. auto: features if there are any."""
     odometry: bool = False
     """Odometry: the last action and whether it was blocked, the pose relative to the start, and a
     map of where the agent has been. Not in the paper; works with any model."""
@@ -96,20 +95,19 @@ class NetworkConfig:
     """Requires --odometry. Estimates the target's position from the bearings of its past
     detections. Not in the paper; for models that are shown a box of every object."""
     sensors: tuple[str, ...] = ()
-    """Further sensors: dotted names of modules of your own that have a function `make`
-    (docs/sensors.md)."""
+    """Further sensors: dotted names of custom modules with a function `make` (docs/sensors.md)."""
     inner_rate: float = 1e-4
-    """Size of the inner gradient steps of the models that adapt."""
+    """Learning rate of the inner gradient steps (savn, li)."""
     first_order: bool = False
-    """Trains the models that adapt without the gradient through their inner steps, but for the
-    learned loss."""
+    """First-order meta-learning (savn, li): do not differentiate through the inner steps, except
+    into the learned loss."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Operands of the large products; parameters and sums are always float32. auto: bfloat16 where
-    the hardware multiplies it faster, on accelerators and on CPUs with AMX."""
+    """Precision of the operands of large matrix products; parameters and sums are always float32.
+    auto: bfloat16 on accelerators and on CPUs with AMX, where it is faster."""
 
     @property
     def spec(self) -> ObservationSpec:
-        """What the agent is shown, as far as the flags say it; the model may narrow it."""
+        """What the flags ask to show the agent; the model decides on rows and image in the end."""
         flags = {"odometry": self.odometry, "triangulation": self.triangulation}
         chosen = (*(name for name, on in flags.items() if on), *self.sensors)
         return ObservationSpec(rows=self.rows, sensors=tuple(dict.fromkeys(chosen)))
@@ -120,46 +118,46 @@ class TrainConfig:
     """One training run."""
 
     split: str = "18/4"
-    """Seen/unseen target classes: 22/0, 18/4 or 14/8; or the unseen classes themselves, separated
-    by commas: Mug,Vase,CD,Towel."""
+    """Seen/unseen target classes: 22/0, 18/4 or 14/8; or a comma-separated list of unseen classes:
+    Mug,Vase,CD,Towel."""
     model: str = "tdanet"
-    """The model to train: tdanet, one of its ablations (tdanet-no-ta without target attention,
-    tdanet-no-sa without the Siamese comparison, tdanet-no-ta-sa without either), ssnet, mjolnir-o,
-    mjolnir-r (the same with an image), baseline (an image and an LSTM), sp (the baseline with scene
-    priors; sp-wide in the published size), savn (the baseline, which goes on learning while it
-    acts), li (mjolnir-o, which does so, too), or the dotted name of a module of your own that has a
-    function `make` (docs/models.md)."""
+    """The model: tdanet, one of its ablations (tdanet-no-ta without target attention, tdanet-no-sa
+    without the Siamese comparison, tdanet-no-ta-sa without either), ssnet, mjolnir-o, mjolnir-r
+    (mjolnir-o with an image), baseline (an image and an LSTM), sp (baseline with scene priors;
+    sp-wide has the published size), savn (baseline that keeps learning while it acts), li
+    (mjolnir-o that does so), or the dotted name of a custom module with a function `make`
+    (docs/models.md)."""
     steps: int | None = None
-    """Stop after this many environment steps (actions); of several budgets, at the one that is
-    spent first. 12,000,000 where no budget is given."""
+    """Budget in environment steps (actions). If several budgets are given, training stops when the
+    first runs out; if none is given, after 12,000,000 steps."""
     episodes: int | None = None
-    """Stop after this many training episodes; the paper's budget is 6,000,000."""
+    """Budget in training episodes; the paper's is 6,000,000."""
     minutes: float | None = None
-    """Stop after this much training time, tables, compilation and evaluation not counted."""
+    """Budget in minutes of training time, without loading, compilation and evaluation."""
     seed: int = 0
-    """Seed of parameters, episodes, actions and dropout."""
+    """Random seed of parameters, episodes, actions and dropout."""
     data: str | None = None
-    """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
+    """File of rooms that `experiments.scenes import` wrote, instead of the bundled ones."""
     word_vectors: str | None = None
-    """File of word vectors in place of the bundled GloVe 6B 50d: glove.6B.*.txt, the thor_glove
-    hdf5, or an npz with `words` and `vectors`; its width is the network's."""
+    """File of word vectors instead of the bundled GloVe 6B 50d: glove.6B.*.txt, the thor_glove
+    HDF5 file, or an npz file with `words` and `vectors`. The network takes their dimension."""
     validation: bool = False
-    """Train on 16 of the 20 training rooms of a type, hold one more class out, and evaluate on the
-    other four rooms: for every choice that is not the final number."""
+    """For choosing settings: train in 16 of the 20 training rooms of each type with one more class
+    held out, and evaluate in the other four."""
     chunk_updates: int = 10
-    """Updates in one compiled call, between two looks at the progress."""
+    """Updates per compiled call; progress is reported after each call."""
     checkpoint_minutes: float = 2.0
-    """Time between two checkpoints."""
+    """Minutes between checkpoints."""
     history: int = 20
-    """Points of the budget, evenly spaced, at which the parameters are kept for the learning curve
-    of `experiments.evaluate --history`; 0 keeps none. A point of TDANet takes 12 MB."""
+    """Evenly spaced points of the budget at which parameters are kept, for the learning curve of
+    `experiments.evaluate --history`; 0 keeps none. A point of TDANet takes 12 MB."""
     max_skipped: int = 20
-    """Stop after this many updates, since the start or --resume, that were skipped for a loss or
-    gradient that is not finite."""
+    """Stop after this many skipped updates since the start or --resume. An update is skipped if its
+    loss or gradient is not finite."""
     learner: LearnerConfig = dataclasses.field(default_factory=LearnerConfig)
-    """The update."""
+    """Settings of the update."""
     network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
-    """The network."""
+    """Settings of the network."""
 
     def check(self) -> None:
         """Raises ValueError, with one line that names the flag, if a value is out of range."""
@@ -173,53 +171,17 @@ class TrainConfig:
         if self.model not in MODELS and "." not in self.model:
             known = ", ".join(MODELS)
             raise ValueError(f"--model {self.model}: choose one of {known}, or name a module")
-        positive = {
-            "--steps": self.steps,
-            "--episodes": self.episodes,
-            "--minutes": self.minutes,
-            "--chunk-updates": self.chunk_updates,
-            "--checkpoint-minutes": self.checkpoint_minutes,
-            "--max-skipped": self.max_skipped,
-            "--num-envs": self.learner.num_envs,
-            "--rollout-steps": self.learner.rollout_steps,
-            "--step-limit": self.learner.step_limit,
-            "--learning-rate": self.learner.learning_rate,
-            "--adam-epsilon": self.learner.adam_epsilon,
-            "--max-grad-norm": self.learner.max_grad_norm,
-            "--width": self.network.width,
-            "--hidden": self.network.hidden,
-            "--word-norm": self.network.word_norm,
-            "--inner-rate": self.network.inner_rate,
-        }
-        for flag, value in positive.items():
-            if value is not None and not value > 0:
-                raise ValueError(f"{flag} {value}: must be positive")
-        not_negative = {
-            "--history": self.history,
-            "--final-learning-rate": self.learner.final_learning_rate,
-            "--entropy-weight": self.learner.entropy_weight,
-            "--final-entropy-weight": self.learner.final_entropy_weight,
-            "--value-weight": self.learner.value_weight,
-        }
-        for flag, value in not_negative.items():
-            if value < 0:
-                raise ValueError(f"{flag} {value}: must not be negative")
+        values = {**vars(self), **vars(self.learner), **vars(self.network)}
+        for names, holds, wanted in _RANGES:
+            for name in names:
+                if values[name] is not None and not holds(values[name]):
+                    raise ValueError(f"--{name.replace('_', '-')} {values[name]}: must {wanted}")
         if self.network.image == "features" and self.data is None:
             raise ValueError("--image features: needs --data, rooms that were imported with them")
         self.network.spec.check()
-        if not 0 <= self.learner.size_noise <= 2:
-            raise ValueError(f"--size-noise {self.learner.size_noise}: must be between 0 and 2")
-        shares = {
-            "--gamma": self.learner.gamma,
-            "--gae-lambda": self.learner.gae_lambda,
-            "--dropout": self.network.dropout,
-        }
-        for flag, value in shares.items():
-            if not 0 <= value <= 1 or (flag == "--dropout" and value == 1):
-                raise ValueError(f"{flag} {value}: must be a share between 0 and 1")
 
     def normalised(self) -> TrainConfig:
-        """The same run, as it is kept: its split by its one name, its files by absolute paths."""
+        """The same run as it is saved: with the canonical name of its split, and absolute paths."""
 
         def absolute(path: str | None) -> str | None:
             return None if path is None else str(Path(path).absolute())
@@ -231,17 +193,21 @@ class TrainConfig:
             word_vectors=absolute(self.word_vectors),
         )
 
+    @property
+    def budget(self) -> dict[str, Any]:
+        """The given limits by name: steps, episodes, minutes."""
+        limits = {name: getattr(self, name) for name in BUDGETS}
+        return {name: limit for name, limit in limits.items() if limit is not None}
+
     def with_budget(self, other: TrainConfig) -> TrainConfig:
         """The same run with the budget of another."""
         return dataclasses.replace(self, **{name: getattr(other, name) for name in BUDGETS})
 
     def spent(self, steps: int, episodes: int, seconds: float) -> float:
-        """The share of the budget that is spent after so much training; the run is over at 1."""
+        """Fraction of the budget that has been used; training ends at 1."""
         done = {"steps": steps, "episodes": episodes, "minutes": seconds / 60}
-        limits = {name: getattr(self, name) for name in BUDGETS}
-        if set(limits.values()) == {None}:
-            limits["steps"] = DEFAULT_STEPS
-        return max(done[name] / limit for name, limit in limits.items() if limit is not None)
+        limits = self.budget or {"steps": DEFAULT_STEPS}
+        return max(done[name] / limit for name, limit in limits.items())
 
     @property
     def steps_per_update(self) -> int:
@@ -249,14 +215,39 @@ class TrainConfig:
         return self.learner.num_envs * self.learner.rollout_steps
 
 
+#: Names of settings, the condition on their values, and how an error states it.
+_RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
+    (
+        (
+            "steps", "episodes", "minutes", "chunk_updates", "checkpoint_minutes", "max_skipped",
+            "num_envs", "rollout_steps", "step_limit", "learning_rate", "adam_epsilon",
+            "max_grad_norm", "width", "hidden", "word_norm", "inner_rate",
+        ),
+        lambda value: value > 0,
+        "be positive",
+    ),
+    (
+        (
+            "history", "final_learning_rate", "entropy_weight", "final_entropy_weight",
+            "value_weight",
+        ),
+        lambda value: value >= 0,
+        "not be negative",
+    ),
+    (("size_noise",), lambda value: 0 <= value <= 2, "be between 0 and 2"),
+    (("gamma", "gae_lambda"), lambda value: 0 <= value <= 1, "be between 0 and 1"),
+    (("dropout",), lambda value: 0 <= value < 1, "be at least 0 and below 1"),
+)  # fmt: skip
+
+
 def run_name(config: TrainConfig) -> str:
-    """What a run's folder is called: 18-4-tdanet-seed0, Mug-Vase-tdanet-seed0."""
+    """The name of a run's folder: 18-4-tdanet-seed0, Mug-Vase-tdanet-seed0."""
     split = file_name(config.split) + ("-validation" if config.validation else "")
     return f"{split}-{config.model}-seed{config.seed}"
 
 
 def check_seed(seed: int) -> None:
-    """Raises ValueError if a seed is not one of the 2^32 that give different keys."""
+    """Raises ValueError unless a seed is one of the 2^32 that give different keys."""
     if not 0 <= seed < 2**32:
         raise ValueError(f"--seed {seed}: must be between 0 and {2**32 - 1}")
 
@@ -274,7 +265,7 @@ def _fits(value: Any, kind: Any) -> bool:
     return isinstance(value, kind) and isinstance(value, bool) == (kind is bool)
 
 
-#: The reference's constants, on our environment and update.
+#: The hyperparameters of the reference implementation, in our environment and update.
 PAPER = TrainConfig(
     episodes=6_000_000,
     learner=LearnerConfig(
@@ -292,7 +283,7 @@ PAPER = TrainConfig(
     ),
     network=NetworkConfig(dropout=0.25, rows="object"),
 )
-#: What did best on validation, beyond the paper (docs/results.md).
+#: What did best on validation, with sensors that the paper does not have (docs/results.md).
 BEST = TrainConfig(
     learner=LearnerConfig(gamma=0.97, size_noise=0.5),
     network=NetworkConfig(odometry=True, triangulation=True),
@@ -306,7 +297,7 @@ def to_json(config: TrainConfig) -> dict[str, Any]:
 
 
 def from_json(values: Mapping[str, Any]) -> TrainConfig:
-    """What `to_json` gave.
+    """The configuration that `to_json` made these values from.
 
     Raises:
       ValueError: a field is missing, unknown or out of range.
@@ -336,8 +327,8 @@ def load(path: Path) -> TrainConfig:
     """Reads a run's `config.json`.
 
     Raises:
-      ValueError: the file is missing or unreadable, or names a model or sensor that is neither one
-        of ours, nor imported already, nor in `TDANET_TRUST`: making it would run its code. The
+      ValueError: the file is missing or unreadable; or it names a custom model or sensor that is
+        neither imported already nor in `TDANET_TRUST`, as making it would run its code. The
         message names the file.
     """
     try:

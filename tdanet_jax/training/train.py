@@ -107,7 +107,7 @@ def resumed(folder: Path, budget: TrainConfig | None = None) -> TrainConfig:
     config = configs.load(folder / CONFIG_FILE)
     if checkpoint.is_shared(folder):
         raise ValueError(f"--resume {folder}: a shared agent; there is nothing to continue from")
-    if budget is not None and budget.has_budget:
+    if budget is not None and budget.budget:
         config = config.with_budget(budget)
         config.check()
     return config

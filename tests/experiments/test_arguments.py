@@ -37,7 +37,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--entropy-weight nan", "--entropy-weight nan: must be finite"),
         ("--entropy-weight=-1", "--entropy-weight -1.0: must not be negative"),
         ("--max-grad-norm 0", "--max-grad-norm 0.0: must be positive"),
-        ("--gamma 1.5", "--gamma 1.5: must be a share between 0 and 1"),
+        ("--gamma 1.5", "--gamma 1.5: must be between 0 and 1"),
         ("--seed=-1", "--seed -1: must be between 0 and 4294967295"),
         ("--seed 99999999999999999999", "--seed 99999999999999999999: must be between 0 and"),
         ("--rows all", "invalid choice 'all' for argument '--rows'. Expected one of ('class'"),
