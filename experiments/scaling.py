@@ -2,9 +2,9 @@
 
     python -m experiments.scaling --out scaling
 
-One size is changed at a time, the others stay as they are by default. More rooms are the 80
-training rooms repeated, more classes and detections are rows that never occur: what is measured is
-their size. Writes scaling.jsonl and scaling.png into --out.
+Changes one size at a time; the others keep their defaults. Additional rooms repeat the 80 training
+rooms; additional classes and detections are rows that never occur. Writes scaling.jsonl and
+scaling.png into --out.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class Command:
     environments: tuple[int, ...] = (32, 64, 128, 256, 512, 1024, 2048)
     """Numbers of environments."""
     rooms: tuple[int, ...] = (10, 30, 80, 250, 1000)
-    """Numbers of training rooms; 80 are there."""
+    """Numbers of training rooms; there are 80."""
     classes: tuple[int, ...] = (117, 250, 500, 1000, 2000)
     """Sizes of the vocabulary; at least 117."""
     detections: tuple[int, ...] = (74, 128, 256, 512)
-    """Rows of an observation; at least as many as a frame can hold."""
+    """Rows of an observation; at least as many as a frame has detections."""
     repeats: int = 3
     """Timed repetitions of each figure."""
     out: Path = Path("scaling")

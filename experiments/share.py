@@ -2,9 +2,9 @@
 
     python -m experiments.share --checkpoint runs/... --out agents/mine
 
-A fiftieth of a run: its newest network with 16 bits a parameter, configuration, classes, and the
-run's results and records. Enough to load, evaluate, replay and look at; not to go on training.
-Rooms and word vectors of your own (--data, --word-vectors) are not in it: pass them on, too.
+A fiftieth of the run's size: its newest network with 16 bits per parameter, configuration, classes,
+results and records. Enough to load, evaluate and replay the agent; not to continue training. Custom
+rooms and word vectors (--data, --word-vectors) are not included: share them as well.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Results of several networks side by side: rows of runs, means over seeds, learning curves.
+"""Results of several networks in comparison: rows of runs, means over seeds, learning curves.
 
-A result is the content of a `results.json`, a plain dictionary; `saved.Evaluated.results` adds
-where in its run the network was, and the run's settings.
+A result is the content of a `results.json`, a plain dictionary; `saved_networks.Evaluated.results`
+adds the run's folder, progress and settings.
 """
 
 from __future__ import annotations
@@ -23,15 +23,14 @@ Result = Mapping[str, Any]
 #: The records of a network by group, as the columns of `report.columns`.
 Columns = Mapping[str, Mapping[str, np.ndarray]]
 MEASURES = ("SR", "SPL")
-#: Flags that let an agent sense what the paper's do not.
+#: Flags of sensors, which the paper's agents do not have.
 BEYOND = ("--odometry", "--triangulation", "--sensors")
-#: Flags that make no other agent: the seed, which distinguishes repetitions, and what only says
-#: how often something is looked at or kept.
+#: Flags that do not change the trained agent: the seed, and logging or checkpoint intervals.
 NOT_SETTINGS = ("--seed", "--chunk-updates", "--checkpoint-minutes", "--history", "--max-skipped")
 
 
 class Spread(NamedTuple):
-    """A mean over seeds; `sd` is the deviation of single seeds, None for one seed."""
+    """A mean over seeds; `sd` is the standard deviation, None for a single seed."""
 
     mean: float
     sd: float | None
@@ -55,12 +54,12 @@ def _flags(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def settings(config: TrainConfig) -> dict[str, Any]:
-    """The flags in which repetitions of a run must agree."""
+    """The flags that repetitions of a run share."""
     return {flag: value for flag, value in flags(config).items() if flag not in NOT_SETTINGS}
 
 
 class _Kind(NamedTuple):
-    """What repetitions of a run agree in."""
+    """What repetitions of a run have in common."""
 
     model: str
     split: str
@@ -73,20 +72,19 @@ def _kind(result: Result) -> _Kind:
         "--policy": result["policy"],
         "scene tables": result["data_version"],
     }
-    for flag in ("--model", "--split", "--validation"):  # the model and the split say these
+    for flag in ("--model", "--split", "--validation"):  # part of the model and the split
         values.pop(flag, None)
     return _Kind(result["model"], result["split"], tuple(values.items()))
 
 
 def labels(results: Sequence[Result], names: Sequence[str]) -> list[str]:
-    """A label for each result: the same for those that differ in the seed alone.
+    """A label for each result; results that differ only in the seed share one.
 
-    It is the model's name and the values in which the results of that model differ; what an agent
-    senses that the paper's do not is always said. Results that repeat a seed are no sample of
-    seeds: each has its name behind the label.
+    A label is the model's name, its sensors, and the settings in which the results of that model
+    differ. Results that repeat a seed are not a sample of seeds: their names are added.
 
     Args:
-      results: with their runs' `settings`; without any where nothing was trained.
+      results: results, with their runs' `settings` if something was trained.
       names: one for each result; points of one run share one.
     """
     kinds = [_kind(result) for result in results]
@@ -111,7 +109,7 @@ def _shown(flag: str, value: Any) -> str:
 
 
 def spread(values: Iterable[float | None]) -> Spread | None:
-    """Mean and deviation of what is not None; None if nothing is left."""
+    """Mean and standard deviation of the values that are not None; None if there are none."""
     known = [value for value in values if value is not None]
     if not known:
         return None
@@ -146,14 +144,14 @@ def _groups(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def with_differences(results: Sequence[Result], played: Sequence[Columns]) -> list[Result]:
-    """Results with their `difference` to the first of the same episodes, group by group.
+    """Adds to each result its `difference` from the first result in the same episodes, by group.
 
-    It is None for that first one itself. Otherwise `to` is the other's run; a group holds ours
-    minus theirs, as `metrics.difference` says it.
+    It is None for that first one itself. Otherwise `to` is the other's run, and each group holds
+    `metrics.difference`, ours minus theirs.
 
     Args:
-      results: as `saved.Evaluated.results` gives them.
-      played: the records behind each.
+      results: as `saved_networks.Evaluated.results` gives them.
+      played: the records of each.
     """
     out: list[Result] = []
     for i, result in enumerate(results):
@@ -173,7 +171,7 @@ def with_differences(results: Sequence[Result], played: Sequence[Columns]) -> li
 def _same_episodes(
     results: Sequence[Result], played: Sequence[Columns], one: int, other: int
 ) -> bool:
-    """Whether two networks began at the same points of the same rooms, for the same targets."""
+    """Whether two networks have the same starts and targets in the same rooms."""
     ours, theirs = played[one], played[other]
     return (
         all(results[one][name] == results[other][name] for name in ("split", "data_version"))
@@ -189,11 +187,11 @@ def _same_episodes(
 def table(
     first: Sequence[str], rows: Iterable[tuple[Sequence[str], Mapping[str, Any]]]
 ) -> list[str]:
-    """A table in the paper's form: SR and SPL of seen and unseen targets, L >= 1 and L >= 5.
+    """A table as in the paper: SR and SPL of seen and unseen targets, L >= 1 and L >= 5.
 
     Args:
-      first: headings of the columns before the figures.
-      rows: the cells of these columns, and group -> bucket -> measure -> anything that prints.
+      first: headings of the columns before the results.
+      rows: the cells of these columns, and group -> bucket -> measure -> a printable value.
     """
     names = [f"{g} {m} {b}" for g in GROUPS for b in BUCKETS for m in MEASURES]
     heads = [*first, *names]
@@ -227,11 +225,12 @@ def paper_rows(split: str) -> dict[str, dict[str, Any]]:
 
 
 def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
-    """A page about several networks: a row for each, means over seeds, the paper's rows.
+    """A page on several networks: a row for each, means over seeds, the paper's rows.
 
     Args:
-      results: as `saved.Evaluated.results` gives them.
-      runs: a short name for each; points of one run, which have no mean, share one.
+      title: of the page.
+      results: as `saved_networks.Evaluated.results` gives them.
+      runs: a short name for each; points of one run, which are not averaged, share one.
     """
     lines = [f"# {title}", "", "SR and SPL in percent, test rooms."]
     for split in dict.fromkeys(result["split"] for result in results):
@@ -259,7 +258,7 @@ _Row = tuple[Sequence[str], Mapping[str, Any]]
 
 
 def _differences(results: Sequence[Result], names: Sequence[str]) -> Iterator[_Row]:
-    """A row for every network with a difference to another."""
+    """A row for each network that is compared with another."""
     for result, name in zip(results, names, strict=True):
         if (difference := result.get("difference")) is None:
             continue
@@ -276,7 +275,7 @@ def _differences(results: Sequence[Result], names: Sequence[str]) -> Iterator[_R
 
 
 def _means(results: Sequence[Result], names: Sequence[str]) -> Iterator[_Row]:
-    """A row for every label that several seeds share; none among the points of histories."""
+    """A row for each label that several seeds share; none for points of histories."""
     if len(set(names)) < len(names):
         return
     together: dict[str, list[Result]] = {}
@@ -288,7 +287,7 @@ def _means(results: Sequence[Result], names: Sequence[str]) -> Iterator[_Row]:
 
 
 class Curve(NamedTuple):
-    """A learning curve: means over seeds at each point, and how far single seeds lie from them."""
+    """A learning curve: means and standard deviations over seeds at each point."""
 
     label: str
     episodes: list[float]  # training episodes, mean over seeds
@@ -298,7 +297,11 @@ class Curve(NamedTuple):
 def curve(label: str, runs: Sequence[Sequence[Result]]) -> Curve:
     """The curve of one or several seeds, from the results of their histories.
 
-    Only the points of the budget that every seed has are taken.
+    It has the points of the budget that all seeds have.
+
+    Args:
+      label: its name.
+      runs: the results of each seed's history.
     """
     by_share = [{result["share"]: result for result in run} for run in runs]
     common = sorted(set.intersection(*(set(points) for points in by_share)))

@@ -1,4 +1,4 @@
-"""Fixed lists of evaluation episodes, committed as integers with the hash of their tables."""
+"""Fixed lists of test episodes, stored as integers with the hash of their tables."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def draw(
     per_room_type: int,
     seed: int,
 ) -> Episodes:
-    """Draws episodes as training does: scene, target and start uniform, each given the one before.
+    """Draws episodes as training does: uniformly a scene, then a target in it, then a start.
 
-    A target is drawn among those of the room type that can be reached in the scene from somewhere,
-    a start among the positions that can reach it, its rotation among the eight; the horizon is 0.
+    Targets are those of the room type that can be reached from somewhere in the scene; starts are
+    positions from which the target can be reached, with any of the eight rotations and horizon 0.
     """
     rng = np.random.default_rng(seed)
     index = {name: i for i, name in enumerate(tables.scenes)}
@@ -97,18 +97,17 @@ def build_asset(tables: SceneTables, out_dir: Path) -> Path:
 
 
 def load(tables: SceneTables, split: Split, extras: Extras | None = None) -> dict[str, Episodes]:
-    """The lists of a split: group -> episodes.
+    """The test episodes of a split, by group.
 
-    Those of the published splits in the bundled rooms are committed; those of other splits are
-    drawn in the same way. Imported rooms have the published ones that came with them; a group of
-    which none can be solved, and all of rooms without any, are drawn. What is drawn is the same
-    every time.
+    In the bundled rooms, the lists of the published splits are stored; those of other splits are
+    drawn in the same way. Imported rooms have the published episodes that came with them; a group
+    without any that can be solved is drawn. A drawn list is the same every time.
 
     Args:
       extras: what came with imported rooms; None with the bundled ones.
 
     Raises:
-      ValueError: the committed lists belong to other tables, or nothing can be evaluated.
+      ValueError: the stored lists belong to other tables, or nothing can be evaluated.
     """
     if extras is None:
         return _committed(tables, split) or draw_split(tables, split)
@@ -122,8 +121,10 @@ def load(tables: SceneTables, split: Split, extras: Extras | None = None) -> dic
 def published(
     tables: SceneTables, split: Split, listed: Sequence[PublishedEpisode]
 ) -> dict[str, Episodes]:
-    """The published test episodes of a split's evaluation rooms, by group; none for a group
-    without any. Episodes whose target the start cannot reach are left out."""
+    """The published test episodes of a split's evaluation rooms, by group, if there are any.
+
+    Episodes whose target cannot be reached are left out.
+    """
     scenes = {name: i for i, name in enumerate(tables.scenes) if name in split.eval_scenes}
     lists: dict[str, Episodes] = {}
     for group, targets in zip(GROUPS, (split.seen, split.unseen), strict=True):
@@ -147,7 +148,7 @@ def published(
 
 
 def _committed(tables: SceneTables, split: Split) -> dict[str, Episodes]:
-    """The committed lists of a split, which are drawn from these tables; none of other splits."""
+    """The stored lists of a published split; none of another."""
     with np.load(assets.path(ASSET), allow_pickle=False) as data:
         version = bytes(data["data_version"]).decode()
         if version != tables.data_version:

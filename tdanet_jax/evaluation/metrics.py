@@ -25,9 +25,10 @@ def summarise(
 
     Args:
       success: [E] bool.
-      shortest: [E] L, length: [E] e, both with Done.
-      cluster: [E] int, the (room, target) pair of each episode. Episodes of one pair are alike, so
-        the intervals resample pairs, not episodes.
+      shortest: [E] L, including Done.
+      length: [E] e, including Done.
+      cluster: [E] int, the (room, target) pair of each episode. Episodes of a pair are correlated,
+        so the intervals resample pairs, not episodes.
 
     Returns:
       bucket -> SR, SPL, SR_ci, SPL_ci (each [low, high]) and n; None where n is 0.
@@ -38,17 +39,17 @@ def summarise(
 def difference(
     ours: Mapping[str, np.ndarray], theirs: Mapping[str, np.ndarray]
 ) -> dict[str, dict[str, object]]:
-    """By how much two agents differ in the same episodes: ours minus theirs, per bucket of L.
+    """The difference between two agents in the same episodes, ours minus theirs, per bucket of L.
 
-    What is averaged and resampled are the differences of single episodes: how hard an episode is
-    for both does not widen the intervals (the paired bootstrap).
+    The paired bootstrap: the differences of single episodes are averaged and resampled, so that an
+    episode that is hard for both does not widen the intervals.
 
     Args:
       ours: `success`, `shortest`, `length` and `cluster` of the episodes (`summarise`).
       theirs: the same of the other agent.
 
     Returns:
-      What `summarise` gives, of the differences; they are percentage points.
+      As `summarise`, in percentage points.
     """
     mine, other = (
         _rates(*(column[name] for name in ("success", "shortest", "length")))
@@ -86,7 +87,7 @@ def _averages(
 
 
 def shown(bucket: Mapping[str, Any], measure: str) -> str:
-    """A mean and its interval, as every table has them: 75.1 (70.2 to 80.0)."""
+    """A mean and its interval, as in every table: 75.1 (70.2 to 80.0)."""
     if bucket[measure] is None:
         return "-"
     low, high = bucket[f"{measure}_ci"]
@@ -118,7 +119,7 @@ def cluster_interval(values: np.ndarray, cluster: np.ndarray) -> tuple[np.ndarra
 def grouped(
     columns: Mapping[str, np.ndarray], key: str, names: Iterable[str]
 ) -> dict[str, dict[str, dict[str, object]]]:
-    """`summarise` for each value of a column, in the order of `names`; absent values left out."""
+    """`summarise` for each value of a column that occurs, in the order of `names`."""
     out = {}
     for name in names:
         chosen = columns[key] == name

@@ -1,7 +1,6 @@
-"""What the paper reports (Lian and Zhang, RA-L 2024, arXiv 2404.08353), to stand beside ours.
+"""Results of the paper (Lian and Zhang, RA-L 2024, arXiv 2404.08353), to show next to ours.
 
-The rows of its tables that are at hand, no more.
-Every place that shows one says that the worlds differ (`worlds`).
+Only some rows of its tables. Where they are shown, a note says that the worlds differ (`worlds`).
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ WORLDS_DIFFER = (
 
 
 def worlds(data: str | None) -> str:
-    """What to say beside the paper's rows; `data` is a file of rooms other than the bundled."""
+    """The note on the paper's rows; `data` is a file of rooms other than the bundled ones."""
     return WORLDS_DIFFER if data is None else f"These rooms are those of {data}."
 
 
@@ -41,7 +40,7 @@ RATES = (
 #: Parameters in units of 2^20, which is how the published tables count.
 PARAMETERS = {"TDANet": 3.08, "MJOLNIR-o": 3.42, "SSNet": 2.00}
 
-#: The paper's name of what is called otherwise here.
+#: Models by the paper's names.
 NAMES = {
     "tdanet": "TDANet",
     "mjolnir-o": "MJOLNIR-o",

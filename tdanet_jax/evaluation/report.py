@@ -94,7 +94,8 @@ class Provenance:
           config: the network's run, with the rooms of the evaluation.
           policy: "sample" or "greedy" for networks, else the policy's name.
           evaluation_seed: of the actions sampled in the test episodes.
-          episodes, updates: training episodes and updates of the network.
+          episodes: training episodes of the network.
+          updates: training updates of the network.
         """
         network = policy in ("sample", "greedy")
         return cls(

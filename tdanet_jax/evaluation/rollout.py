@@ -22,10 +22,10 @@ class Records:
     """What happened in each of E episodes.
 
     Attributes:
-      shortest: [E] int32, L, actions on the optimal path with Done.
-      length: [E] int32, e, actions taken with Done.
+      shortest: [E] int32, L, actions on the shortest path, including Done.
+      length: [E] int32, e, actions taken, including Done.
       success: [E] bool, Done while an instance of the target was visible.
-      actions: [E, N] int8, actions taken; -1 behind the last, N the largest step limit.
+      actions: [E, N] int8, actions taken; -1 after the last, N the largest step limit.
     """
 
     shortest: np.ndarray
@@ -37,7 +37,7 @@ class Records:
 def evaluate(
     policy: Policy, weights: Any, params: EnvParams, episodes: Episodes, key: jax.Array
 ) -> Records:
-    """Lets `policy` play every episode to its end. One compiled call; equal keys, equal records."""
+    """Plays every episode to its end, in one compiled call; equal keys give equal records."""
     limit = int(np.max(np.asarray(params.step_limit)))
     pose, target = jnp.asarray(episodes.pose), jnp.asarray(episodes.target)
     out = jax.device_get(_play(policy, limit, weights, params, pose, target, key))
@@ -47,7 +47,7 @@ def evaluate(
 def evaluate_lists(
     policy: Policy, weights: Any, params: EnvParams, lists: Mapping[str, Episodes], seed: int
 ) -> dict[str, tuple[Episodes, Records]]:
-    """`evaluate` on every list of a split, each with a random stream of its own."""
+    """`evaluate` on every list of a split, each with its own random stream."""
     key = jax.random.key(seed)
     return {
         group: (chosen, evaluate(policy, weights, params, chosen, jax.random.fold_in(key, i)))
@@ -63,14 +63,13 @@ def evaluate_stacked(
     seed: int | Sequence[int],
     batched: bool | None = None,
 ) -> list[dict[str, tuple[Episodes, Records]]]:
-    """`evaluate_lists` of W networks in one compiled call a list.
+    """`evaluate_lists` for W networks, with one compiled call per list.
 
     Args:
       weights: parameters stacked, each leaf [W, ...].
       seed: of all, or one for each [W].
-      batched: whether the networks play side by side or one after the other. None does what is
-        faster: side by side on an accelerator; on a processor, whose products are large enough
-        already, one after the other.
+      batched: whether the networks play in parallel or one after the other. None chooses what is
+        faster: in parallel on an accelerator, one after the other on a CPU.
 
     Returns:
       What `evaluate_lists` gives for each network. Equal seeds, equal random streams.

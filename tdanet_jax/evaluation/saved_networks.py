@@ -1,25 +1,24 @@
-"""Networks that training runs have saved: found on disk, and evaluated together.
+"""The networks that runs have saved: found on disk, and evaluated together.
 
-Networks of one shape and task are stacked and played in one compiled call, so that the learning
-curve of a run's whole history costs one compilation.
+Networks of one task are stacked and played in one compiled call: a run's whole history costs one
+compilation.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.evaluation import comparison, episodes, policies, report, rollout
-from tdanet_jax.evaluation.episodes import Episodes
-from tdanet_jax.evaluation.rollout import Records
+from tdanet_jax.evaluation.report import Played
 from tdanet_jax.models import classes
 from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
 from tdanet_jax.task import Task, load_task
@@ -27,10 +26,8 @@ from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import Checkpoints, is_shared, newest
 from tdanet_jax.training.history import Snapshot
 
-#: Networks in one call; bounds the memory that a long list takes.
+#: Networks in one call, at most; bounds the memory.
 TOGETHER = 20
-
-Played = Mapping[str, tuple[Episodes, Records]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,19 +52,19 @@ class SavedNetwork:
         return self.config.data if self.data is None else self.data
 
     def load(self) -> Snapshot:
-        """Reads it. Raises ValueError if it cannot be read."""
+        """Reads the network. Raises ValueError if it cannot be read."""
         return newest(self.run) if self.point is None else history.read(self.point)
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluated:
-    """A saved network, what it was, and what it did.
+    """A saved network and its evaluation.
 
     Attributes:
-      saved: where it is.
-      snapshot: where its run was; without the weights.
+      saved: the network on disk.
+      snapshot: the progress of its run then; without the weights.
       task: what it was evaluated on.
-      provenance: the head of its results.
+      provenance: where its results come from.
       played: its episodes by group.
     """
 
@@ -78,8 +75,10 @@ class Evaluated:
     played: Played
 
     def results(self) -> dict:
-        """The content of a `results.json`, after the run's folder and where the run was; the run's
-        settings behind it. `point` and `share` are None where it is no point of a history."""
+        """The content of a `results.json`, with the run's folder, progress and settings.
+
+        `point` and `share` are None unless it is a point of a history.
+        """
         point = None if self.saved.point is None else self.snapshot.point
         return {
             "run": str(self.saved.run),
@@ -91,7 +90,7 @@ class Evaluated:
             "settings": comparison.settings(self.saved.config),
         }
 
-    def columns(self) -> dict[str, dict[str, np.ndarray]]:
+    def columns(self) -> dict[str, report.Columns]:
         """Its records by group, as named columns."""
         return {name: report.columns(self.task.tables, *pair) for name, pair in self.played.items()}
 
@@ -100,7 +99,9 @@ def find(run: Path, with_history: bool = False, data: str | None = None) -> list
     """The newest network of a run, or its whole history, oldest first.
 
     Args:
-      data: file of rooms to evaluate in, in place of the run's.
+      run: its folder.
+      with_history: all points of its history.
+      data: file of rooms to evaluate in, instead of the run's.
 
     Raises:
       ValueError: the folder holds no run, or none of its networks.
@@ -117,10 +118,14 @@ def find(run: Path, with_history: bool = False, data: str | None = None) -> list
 
 
 def share(run: Path, out: Path) -> None:
-    """Makes a small folder of a run's newest network: enough to load, evaluate and look at.
+    """Makes a small folder of a run's newest network: enough to load, evaluate and look at it.
 
-    It holds the configuration, the classes, the network with 16 bits a parameter, and the run's
-    results and records if there are any; nothing to go on training with.
+    It holds the configuration, the classes, the network with 16 bits per parameter, and the run's
+    results and records if there are any; training cannot continue from it.
+
+    Args:
+      run: the run's folder.
+      out: the folder to write.
 
     Raises:
       ValueError: the folder holds no run, or its network cannot be read or does not fit.
@@ -138,10 +143,12 @@ def share(run: Path, out: Path) -> None:
 def evaluate(
     networks: Sequence[SavedNetwork], greedy: bool, seed: int | None = None
 ) -> Iterator[Evaluated]:
-    """Plays the fixed test episodes with every network; those of one task come together.
+    """Plays the fixed test episodes with every network, task by task.
 
     Args:
-      seed: of sampled actions; None takes each run's own, as its training does at its end.
+      networks: the networks; those of one task are played in one compiled call.
+      greedy: choose the most probable actions instead of sampling.
+      seed: of sampled actions; None takes each run's own, as at the end of its training.
 
     Raises:
       ValueError: a network cannot be read, or was trained on other scene tables.
@@ -160,7 +167,7 @@ def evaluate(
                 lambda *leaves: jnp.stack(leaves), *(s.weights for s in snapshots)
             )
             seeds = [network.config.seed if seed is None else seed for network in part]
-            # Side by side, networks that adapt would do so in every step.
+            # In parallel, adaptive networks would take their inner steps in every step.
             batched = False if isinstance(task.model, AdaptiveActorCritic) else None
             played = rollout.evaluate_stacked(
                 policy, weights, task.eval_params, lists, seeds, batched
@@ -183,14 +190,13 @@ def evaluate(
 
 
 def _task_config(network: SavedNetwork) -> TrainConfig:
-    """Its configuration in the rooms to evaluate in, all that only training uses at its default."""
-    default = TrainConfig()
-    names = (
-        "steps", "episodes", "minutes", "seed", "chunk_updates", "checkpoint_minutes", "history",
-        "max_skipped", "learner",
-    )  # fmt: skip
-    unused = {name: getattr(default, name) for name in names}
-    return dataclasses.replace(network.config, data=network.rooms, **unused)
+    """The run's config with the evaluation rooms and training-only fields reset.
+
+    Runs of one task thus compare equal.
+    """
+    kept = ("split", "model", "word_vectors", "validation", "network")
+    values: dict[str, Any] = {name: getattr(network.config, name) for name in kept}
+    return TrainConfig(data=network.rooms, **values)
 
 
 def _checked(network: SavedNetwork, task: Task) -> Snapshot:

@@ -31,7 +31,9 @@ def plan(
 
     Args:
       base: all other settings.
-      splits, models, seeds: the values to combine.
+      splits: names of splits.
+      models: names of models.
+      seeds: training seeds.
 
     Raises:
       ValueError: a value is not allowed or given twice; the message names the flag.

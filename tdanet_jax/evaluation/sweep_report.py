@@ -24,8 +24,8 @@ class Cost:
 
     Attributes:
       model: its name.
-      parameters: all trained numbers; word vectors are not among them.
-      milliseconds: of one decision for a batch of so many agents.
+      parameters: number of trained parameters; without word vectors.
+      milliseconds: time of a decision, by the number of agents that decide at once.
     """
 
     model: str
@@ -35,11 +35,11 @@ class Cost:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """All that the report shows.
+    """The content of the report.
 
     Attributes:
       runs: the finished runs.
-      untrained: results of policies that need no training, one for each split and policy.
+      untrained: results of policies without training, one for each split and policy.
       costs: by the runs' labels.
       curves: learning curves by split.
       machine: where the costs were measured.
@@ -60,7 +60,7 @@ class Report:
         return [name for name in UNSEEN if name in names] + sorted(names - set(UNSEEN))
 
     def results(self, split: str) -> dict[str, list[Result]]:
-        """Results on a split by label: those without training, then in the order of MODELS."""
+        """Results on a split by label: policies without training, then models as in MODELS."""
         named = [(result["model"], result) for result in self.untrained]
         named += zip(labels(self.runs), (run.results for run in self.runs), strict=True)
         found: dict[str, list[Result]] = {}
@@ -71,13 +71,13 @@ class Report:
 
 
 def _place(model: str) -> tuple[int, str]:
-    """Sorts models: those without training, then in the order of MODELS, then by name."""
+    """Sort key: policies without training, then models as in MODELS, then others by name."""
     order = ["random", "shortest_path", *MODELS]
     return (order.index(model) if model in order else len(order), model)
 
 
 def make_curves(runs: Sequence[FinishedRun], out: Path) -> dict[str, list[Curve]]:
-    """Learning curves by split, one a label, from the evaluated histories."""
+    """Learning curves by split, one for each label, from the evaluated histories."""
     found: dict[str, dict[str, list[list[Result]]]] = {}
     named = zip(labels(runs), runs, strict=True)
     for label, run in sorted(named, key=lambda pair: _place(pair[1].config.model)):
@@ -131,17 +131,15 @@ def to_json(report: Report) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     """Spreads as {"mean", "sd"}, in dictionaries and lists."""
     if isinstance(value, Spread):
-        return {
-            "mean": round(value.mean, 3),
-            "sd": None if value.sd is None else round(value.sd, 3),
-        }
+        sd = None if value.sd is None else round(value.sd, 3)
+        return {"mean": round(value.mean, 3), "sd": sd}
     if isinstance(value, Mapping):
         return {key: _plain(inner) for key, inner in value.items()}
     return [_plain(inner) for inner in value] if isinstance(value, list) else value
 
 
 def left_out(report: Report) -> list[str]:
-    """One line for each part of the paper's tables that nothing was trained for."""
+    """One line for each part of the paper's tables for which nothing was trained."""
     lines = []
     for split in PAPER_SPLITS:
         trained = {run.config.model for run in report.runs if run.results["split"] == split}
@@ -165,13 +163,14 @@ def markdown(report: Report, figures: Mapping[str, str]) -> str:
     """`report.md`.
 
     Args:
-      figures: name of the learning curve's file by split.
+      report: its content.
+      figures: the learning curve's file name by split.
     """
     lines = [
         f"# {len(report.runs)} runs",
         "",
-        f"SR and SPL in percent, test rooms, sampled actions; mean ± deviation over seeds of one "
-        f"configuration. Code {report.code}.",
+        "SR and SPL in percent, test rooms, sampled actions; mean ± standard deviation over the "
+        f"seeds of a configuration. Code {report.code}.",
     ]
     for split in report.splits:
         lines += _comparison(report, split)
@@ -187,7 +186,7 @@ def markdown(report: Report, figures: Mapping[str, str]) -> str:
 
 
 def _comparison(report: Report, split: str) -> Iterator[str]:
-    """The paper's comparison of models on one split, as a whole and by room type."""
+    """The paper's comparison of models on one split."""
     results = report.results(split)
     summaries = {label: comparison.summary(members) for label, members in results.items()}
     rows = [
@@ -222,7 +221,7 @@ def _by_room(report: Report, split: str) -> Iterator[str]:
 
 
 def _ablations(report: Report) -> Iterator[str]:
-    """TDANet and its parts left out, where any such model was trained."""
+    """TDANet and its ablations, on the splits on which any of them was trained."""
     module = MODELS["tdanet"][0]
     variants = [model for model, (name, _) in MODELS.items() if name == module]
     rows = []
@@ -245,13 +244,8 @@ _ABLATED = {"target_attention": "Target attention", "siamese": "Siamese comparis
 def _costs(report: Report) -> Iterator[str]:
     """Parameters and inference time."""
     batches = list(dict.fromkeys(b for cost in report.costs.values() for b in cost.milliseconds))
-    heads = [
-        "Model",
-        "Parameters",
-        "in 2^20",
-        "in 2^20, paper",
-        *(f"ms, batch {b:,}" for b in batches),
-    ]
+    times = (f"ms, batch {batch:,}" for batch in batches)
+    heads = ["Model", "Parameters", "in 2^20", "in 2^20, paper", *times]
     yield from ("", "## Parameters and inference time", "")
     yield from (f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}")
     for label, cost in sorted(report.costs.items(), key=lambda item: _place(item[1].model)):
@@ -264,8 +258,8 @@ def _costs(report: Report) -> Iterator[str]:
             *(f"{cost.milliseconds[batch]:.2f}" for batch in batches),
         ]
         yield f"| {' | '.join(cells)} |"
-    yield from ("", f"One decision of so many agents at once, on {report.machine}.")
-    yield "The paper's word vectors are 300 wide; the input layers here follow the run's."
+    yield from ("", f"Time of one decision for a batch of agents, on {report.machine}.")
+    yield "The paper's word vectors have 300 dimensions; here the input layers fit those of the run."
 
 
 def _runs(report: Report) -> Iterator[str]:
@@ -273,13 +267,17 @@ def _runs(report: Report) -> Iterator[str]:
     yield from ("", "## Runs", "")
     rows = [
         (
-            (run.folder.name, str(run.results["seed"]), f"{run.results['episodes_trained']:,}",
-             f"{run.results['steps']:,}",
-             "-" if run.seconds is None else f"{run.seconds / 60:.1f}"),
+            (
+                run.folder.name,
+                str(run.results["seed"]),
+                f"{run.results['episodes_trained']:,}",
+                f"{run.results['steps']:,}",
+                "-" if run.seconds is None else f"{run.seconds / 60:.1f}",
+            ),
             run.results,
         )
         for run in report.runs
-    ]  # fmt: skip
+    ]
     heads = ("Run", "Seed", "Training episodes", "Steps", "Training minutes")
     yield from comparison.table(heads, rows)
 

@@ -1,8 +1,8 @@
-"""The devices of a run: environments are split over them, everything else lies on each.
+"""The devices of a run: environments are split over them, everything else is replicated.
 
-XLA partitions the compiled update by where its arguments lie, so the learner knows nothing of
-devices. Random numbers belong to an environment's index in the whole batch: one update on many
-devices is the same update as on one, but for the order in which gradients are added.
+XLA partitions the compiled update by the sharding of its arguments; the learner knows nothing of
+devices. Random numbers depend on an environment's index in the whole batch: an update on many
+devices equals one on a single device, except for the order in which gradients are added.
 
 Several machines, or several processes on one, run the same command with the variables
 JAX_COORDINATOR_ADDRESS (host:port of the first), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
@@ -24,12 +24,12 @@ from tdanet_jax.training.learner import TrainState
 
 AXIS = "environments"
 ADDRESS, PROCESSES, PROCESS = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
-#: Compiled programs that are kept between runs, in bytes.
+#: Size of the cache of compiled programs, in bytes.
 COMPILED_SIZE = 2**30
 
 
 def keep_compiled() -> None:
-    """Keeps compiled programs in the cache folder: a second start need not compile again."""
+    """Caches compiled programs, so that a second start does not compile again."""
     folder = cache.folder() / "compiled"
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_compilation_cache_max_size", COMPILED_SIZE)
@@ -38,17 +38,17 @@ def keep_compiled() -> None:
 
 
 def connect(count: int = 1) -> Mesh:
-    """Joins the other processes, if any, and lays out the devices. Before anything else of JAX.
+    """Joins the other processes, if any, and returns the mesh; call it before any use of JAX.
 
     Args:
-      count: devices to use in this process. A CPU is split into as many.
+      count: devices to use in this process; a CPU is split into as many.
 
     Raises:
       ValueError: there are fewer devices, or the variables of a process are incomplete.
     """
     if count < 1:
         raise ValueError(f"--devices {count}: must be positive")
-    if count > 1:  # a CPU that is in use already is no longer split: too few devices, below
+    if count > 1:  # a CPU that is in use already cannot be split: too few devices, below
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", count)
     if os.environ.get(ADDRESS):
@@ -56,7 +56,7 @@ def connect(count: int = 1) -> Mesh:
             processes, process = int(os.environ[PROCESSES]), int(os.environ[PROCESS])
         except (KeyError, ValueError):
             raise ValueError(f"{ADDRESS} is set: {PROCESSES} and {PROCESS} must be, too") from None
-        # Processes on CPUs wait for each other for ever if each orders its sums as it likes.
+        # Processes on CPUs deadlock if each reduces in its own order.
         flag = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}"
         jax.distributed.initialize(os.environ[ADDRESS], processes, process)
@@ -74,7 +74,7 @@ def first() -> Mesh:
 
 
 def is_lead() -> bool:
-    """Whether this process writes files and prints; always true for a process on its own."""
+    """Whether this process writes files and prints; always true for a single process."""
     return jax.process_index() == 0
 
 
@@ -93,30 +93,30 @@ def anywhere(flag: bool) -> bool:
 
 
 def everywhere(mesh: Mesh) -> NamedSharding:
-    """On every device as a whole."""
+    """Replicated on every device."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def whole(tree: Any, mesh: Mesh) -> Any:
-    """The arrays with every part in this process, which a file can be written from."""
+    """The arrays, gathered in this process, so that they can be written to a file."""
     if jax.process_count() == 1:
         return tree
     return jax.jit(lambda x: x, out_shardings=everywhere(mesh))(tree)
 
 
 def wait_for_all(reason: str) -> None:
-    """Returns when every process has come here."""
+    """Returns when every process has arrived here."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(reason)
 
 
 def split(mesh: Mesh) -> NamedSharding:
-    """One part of the first axis on every device."""
+    """Split along the first axis."""
     return NamedSharding(mesh, PartitionSpec(AXIS))
 
 
 def layout(state: Any, mesh: Mesh) -> Any:
-    """Where each array of a `TrainState` lies: what has a row per environment is split.
+    """The sharding of each array of a `TrainState`: split if it has a row per environment.
 
     Raises:
       ValueError: the environments cannot be divided evenly.

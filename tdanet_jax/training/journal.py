@@ -19,10 +19,10 @@ Row = dict[str, Any]
 
 
 class Journal:
-    """`metrics.jsonl`. Where it cannot be written training goes on, and the rows wait in memory."""
+    """`metrics.jsonl`. If it cannot be written, training continues and the rows wait in memory."""
 
     def __init__(self, path: Path, updates: int) -> None:
-        """Rows behind `updates` belong to updates that will be done again: they are dropped."""
+        """Drops the rows after `updates`, whose updates will be done again."""
         self.path = path
         self._waiting: list[str] = []
         self._size = 0  # bytes of whole rows
@@ -33,7 +33,7 @@ class Journal:
             self._size = len(text)
 
     def write(self, row: Row) -> None:
-        """Appends a row, and those that waited; warns once per time that it cannot."""
+        """Appends a row and those that wait; warns when the first has to wait."""
         self._waiting.append(json.dumps(row, allow_nan=False) + "\n")
         try:
             with self.path.open("ab") as file:
@@ -43,7 +43,7 @@ class Journal:
             self._waiting.clear()
         except OSError as error:
             if len(self._waiting) == 1:
-                reason = f"cannot be written ({error.strerror}); training goes on"
+                reason = f"cannot be written ({error.strerror}); training continues"
                 warnings.warn(f"{self.path}: {reason}, its rows wait in memory", stacklevel=2)
 
 
@@ -63,7 +63,7 @@ def tensorboard_sink(folder: Path) -> Callable[[Row], None]:
 
     If events cannot be written, it gives up with a warning, and training goes on.
     """
-    # Not SummaryWriter: its thread dies of a full disk, and its queue then blocks for ever.
+    # Not SummaryWriter: a full disk ends its thread, and its queue then blocks for ever.
     from tensorboardX.event_file_writer import EventsWriter
     from tensorboardX.proto.event_pb2 import Event
     from tensorboardX.summary import scalar

@@ -52,7 +52,7 @@ class Run:
         shapes = jax.eval_shape(self._init, jax.random.key(0), self._words, self._params)
         self._layout = devices.layout(shapes, self._mesh)
         self.checkpoints = Checkpoints(folder)
-        self._saved: int | None = None  # updates of the checkpoint that holds the present state
+        self._saved: int | None = None  # updates of the checkpoint with the present state
         fresh = self.checkpoints.latest() is None
         self.state: TrainState = self._begin() if fresh else self._restore()
         self._skipped_before = int(self.state.skipped)
@@ -105,19 +105,17 @@ class Run:
 
     @property
     def progress(self) -> float:
-        """Share of the budget that is spent; the run is over at 1."""
+        """Fraction of the budget that has been used; training ends at 1."""
         return self.config.spent(self.steps, int(self.state.episodes), self.seconds)
 
     def chunks(self, until: int | None = None) -> Iterator[Row]:
         """Trains to the end of the budget; yields one row of metrics per chunk.
 
-        Of several processes, the lead alone writes files.
-
-        Compilation is not counted as training time. Stop iterating to stop training; `save` then
-        keeps what is done.
+        Of several processes, the lead alone writes files. Compilation does not count as training
+        time. To stop early, stop iterating; `save` then keeps the progress.
 
         Args:
-          until: stop at this many updates already.
+          until: stop after this many updates.
 
         Raises:
           ValueError: too many updates were skipped; the state is saved first.
@@ -139,20 +137,17 @@ class Run:
         return stopped or self.progress >= 1.0
 
     def _journal(self) -> Journal | None:
-        """The journal, for the lead alone.
-
-        What was written behind the checkpoint is dropped: its updates will be done again.
-        """
+        """The journal, in the lead alone; drops what was written after the checkpoint."""
         if not devices.is_lead():
             return None
         history.drop_after(self.folder, int(self.state.updates))
         return Journal(self.folder / METRICS_FILE, int(self.state.updates))
 
     def _shares(self) -> jax.Array:
-        """Shares of the budget that are spent before and behind the next chunk.
+        """Fractions of the budget that are used before and after the next chunk.
 
-        The chunk is taken to go as those before it did: known from the state alone, so that a run
-        that was stopped goes on with the same schedule.
+        They are extrapolated from the chunks so far, and thus known from the state alone: a run
+        that was stopped continues with the same schedule.
         """
         before = self.progress
         chunks_done = int(self.state.updates) / self.config.chunk_updates
@@ -167,7 +162,7 @@ class Run:
         took: float,
         journal: Journal | None,
     ) -> Row:
-        """Goes on to the state behind a chunk; writes its row and, if one is due, a point."""
+        """Takes the state after a chunk; writes its row and, if one is due, a point."""
         self.state = state
         self.seconds += took
         row = self._row(metrics, took)
@@ -186,9 +181,9 @@ class Run:
             )
 
     def _keep_point(self, before: float) -> None:
-        """Adds to the history if the budget's share has passed a point since `before`.
+        """Adds to the history if a point of the budget has been passed since `before`.
 
-        The run does not depend on it: a point that cannot be written is left out with a warning.
+        A point that cannot be written is left out with a warning; the run does not need it.
         """
         point = history.due(before, self.progress, self.config.history)
         if point:
@@ -217,7 +212,7 @@ class Run:
     def _row(self, metrics: dict[str, np.ndarray], took: float) -> Row:
         """One line of `metrics.jsonl`: means over the chunk's episodes, updates and steps.
 
-        None where there is nothing to take a mean of: no episode ended, or no number was finite.
+        A mean is None if no episode ended, or no value was finite.
         """
         steps = self.config.chunk_updates * self.config.steps_per_update
         episodes = int(metrics["episodes"].sum())
@@ -246,10 +241,10 @@ class Run:
 
 
 def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
-    """`Run.chunks` of several seeds of one configuration: their states stacked, one vmapped call.
+    """`Run.chunks` of several seeds of one configuration, in one vmapped call.
 
-    A run that stands behind the others, after an interruption, first catches up on its own; then
-    the list holds its row alone.
+    A run that is behind the others after an interruption first catches up alone; until then, lists
+    hold its row alone.
 
     Args:
       runs: seeds of one configuration and task, with a budget in steps.
