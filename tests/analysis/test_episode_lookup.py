@@ -1,4 +1,6 @@
-"""Episodes by name: found where they are, refused in words where they are not."""
+"""Episodes by name: found where they exist, refused with a message where they do not."""
+
+from __future__ import annotations
 
 import json
 

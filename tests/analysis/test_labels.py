@@ -1,4 +1,6 @@
-"""Names in pictures do not cover each other, and the first ones come first."""
+"""Names in pictures do not cover each other, and the most important ones come first."""
+
+from __future__ import annotations
 
 import numpy as np
 from hypothesis import given

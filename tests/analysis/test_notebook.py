@@ -1,5 +1,7 @@
 """The notebook runs from its first cell to its last, on any run."""
 
+from __future__ import annotations
+
 import os
 import re
 from pathlib import Path
@@ -32,7 +34,7 @@ def test_it_runs(notebook, opinionated_run, tmp_path, monkeypatch):
     assert loaded.startswith("tdanet split 18/4")
 
 
-def test_it_is_committed_with_the_outputs_of_a_run_and_without_anybodys_paths(notebook):
+def test_it_is_committed_with_the_outputs_of_a_run_and_without_local_paths(notebook):
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
     assert all(out.output_type != "error" for cell in code for out in cell.outputs)

@@ -1,5 +1,7 @@
 """The replay page: its data, and what a real browser makes of it."""
 
+from __future__ import annotations
+
 import dataclasses
 import json
 import re
@@ -79,7 +81,7 @@ def chromium():
 
 @pytest.fixture
 def visit(chromium, tmp_path):
-    """Opens a page; at the end, it must not have complained or asked for anything."""
+    """Opens a page that must log no errors and request no other file."""
     complaints, requests, contexts = [], [], []
 
     def opened(html, **options):

@@ -1,5 +1,7 @@
 """The commands that show what an agent does: replay, trajectories, attention."""
 
+from __future__ import annotations
+
 import csv
 import dataclasses
 import json
@@ -10,6 +12,7 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from experiments import attention, evaluate, replay, trajectories
 from experiments.one_episode import Choice
@@ -23,7 +26,7 @@ from tests.support import browser, original
 
 @pytest.mark.parametrize("command", [replay, trajectories, attention, evaluate])
 def test_what_is_compiled_is_kept_for_the_next_start(monkeypatch, capsys, opinionated_run, command):
-    """From the first program on: when that is compiled, JAX decides whether it keeps any."""
+    """From the first program on: JAX decides whether to keep any when it compiles that one."""
 
     def keep():
         raise ValueError("compiled programs are kept")
@@ -74,7 +77,7 @@ def test_wrong_arguments_give_one_line_and_write_nothing(
 
 
 def test_a_picture_of_an_unknown_kind_is_refused(tmp_path, capsys, rooms_file, opinionated_run):
-    out = tmp_path / "way.jpeg2"
+    out = tmp_path / "paths.jpeg2"
     with pytest.raises(SystemExit):
         trajectories.main(
             ["--checkpoint", str(opinionated_run), "--episode", "1", "--data", str(rooms_file),
@@ -84,8 +87,10 @@ def test_a_picture_of_an_unknown_kind_is_refused(tmp_path, capsys, rooms_file, o
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ways_of_two_runs_and_the_shortest_are_drawn(tmp_path, capsys, rooms_file, opinionated_run):
-    run, out = str(opinionated_run), tmp_path / "new" / "way.svg"
+def test_paths_of_two_runs_and_the_shortest_are_drawn(
+    tmp_path, capsys, rooms_file, opinionated_run
+):
+    run, out = str(opinionated_run), tmp_path / "new" / "paths.svg"
     trajectories.main(
         ["--checkpoint", run, "--checkpoint", run, "--shortest", "--episode", "3",
          "--data", str(rooms_file), "--out", str(out)]
@@ -97,7 +102,16 @@ def test_ways_of_two_runs_and_the_shortest_are_drawn(tmp_path, capsys, rooms_fil
     assert re.search(rf"{run}: {how}.*, {record['e']} action", said)
     assert f"shortest path: success, {record['L']} action" in said
     assert "<svg" in out.read_text()
-    assert [path.name for path in out.parent.iterdir()] == ["way.svg"]
+    assert [path.name for path in out.parent.iterdir()] == ["paths.svg"]
+
+
+def test_an_episode_is_animated(tmp_path, rooms_file, opinionated_run):
+    out = tmp_path / "episode.gif"
+    chosen = ["--episode", "3", "--data", str(rooms_file), "--out", str(out)]
+    trajectories.main(["--checkpoint", str(opinionated_run), *chosen])
+    record = json.loads((opinionated_run / "episodes.jsonl").read_text().splitlines()[3])
+    with Image.open(out) as file:
+        assert file.n_frames == record["e"] + 1
 
 
 def test_attention_is_averaged_over_the_test_episodes_and_one_is_drawn(
@@ -134,7 +148,7 @@ def test_attention_is_averaged_over_the_test_episodes_and_one_is_drawn(
     assert (out / f"{record['scene']}-{record['target']}.png").stat().st_size > 10_000
 
 
-def test_every_network_and_policy_has_a_folder_of_its_own(tmp_path):
+def test_every_network_and_policy_has_its_own_folder(tmp_path):
     run, point = tmp_path / "run", tmp_path / "run" / "history" / "00000020.npz"
     greedy = Choice(policy="greedy")
     for checkpoint, choice, name in (
@@ -145,7 +159,7 @@ def test_every_network_and_policy_has_a_folder_of_its_own(tmp_path):
         assert attention.default_folder(attention.Command(checkpoint, choice)) == run / name
 
 
-def test_a_model_that_sees_an_image_and_adapts_stands_beside_another(
+def test_a_model_that_sees_an_image_and_adapts_is_shown_next_to_another(
     tmp_path, capsys, rooms_file, opinionated_run, some_rooms, glove
 ):
     run, out = tmp_path / "savn", tmp_path / "both.html"
@@ -170,7 +184,7 @@ def test_a_model_that_sees_an_image_and_adapts_stands_beside_another(
 def test_a_model_that_was_trained_on_feature_maps_sees_those_of_the_rooms(
     tmp_path, monkeypatch, capsys, rooms_file, glove
 ):
-    """Of the rooms that it is shown in, be they its own or others."""
+    """Those of the rooms in which it is shown, its own or others."""
     monkeypatch.setenv("TDANET_CACHE", str(tmp_path / "cache"))
     rooms = importer.read_folder(original.write_all(tmp_path / "original"), lambda *_: None)
     maps = np.random.default_rng(0).normal(size=(rooms.tables.num_states, 512, 7, 7))

@@ -1,4 +1,4 @@
-"""A headless Chromium for tests that look at pages, where there is one."""
+"""A headless Chromium, if there is one, for tests of pages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 
 @contextlib.contextmanager
 def launch() -> Iterator[Any]:
-    """A browser of Playwright; skips the test where there is no Chromium."""
+    """Playwright's browser; skips the test if there is no Chromium."""
     api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
     found = next(filter(None, map(shutil.which, NAMES)), None)
     with api.sync_playwright() as playwright:
