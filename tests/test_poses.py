@@ -31,6 +31,6 @@ def test_arrays_are_taken_apart_as_numbers_are(array) -> None:
     assert (joined == every).all()
 
 
-def test_rotations_go_round() -> None:
+def test_rotations_wrap_around() -> None:
     assert poses.from_degrees(3, -45, 30) == poses.from_degrees(3, 315, 30) == (3 * 8 + 7) * 2 + 1
     assert poses.from_degrees(3, 360, 0) == poses.join(3) == 3 * 16

@@ -1,4 +1,4 @@
-"""Word vectors of classes and of labels that people type."""
+"""Word vectors of classes and of typed labels."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_table_has_a_row_per_name() -> None:
     np.testing.assert_array_equal(table[2], SMALL.embed("CoffeeMachine", 4.0))
 
 
-def test_every_class_of_the_bundled_rooms_has_a_vector_of_its_own(
+def test_every_class_of_the_bundled_rooms_has_its_own_vector(
     ithor: SceneTables, glove: WordVectors
 ) -> None:
     table = glove.table(ithor.classes)
@@ -159,7 +159,7 @@ def test_npz_files_of_vectors(tmp_path: Path) -> None:
     [("", "no word vectors"), ("a 1 2\nb 1\n", "line 2 is not"), ("a 1 x\n", "line 1 is not"),
      ("a 1 nan\n", "line 1 is not"), ("a\n", "line 1 is not")],
 )  # fmt: skip
-def test_text_files_that_hold_no_vectors(tmp_path: Path, text: str, reason: str) -> None:
+def test_text_files_without_vectors(tmp_path: Path, text: str, reason: str) -> None:
     path = tmp_path / "glove.txt"
     path.write_text(text)
     with pytest.raises(FileError, match=rf"glove\.txt: {reason}"):

@@ -26,7 +26,7 @@ from tests.support.command import TINY
 
 @pytest.fixture(autouse=True)
 def parts_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Imports keep their parts in a cache of their own; the bundled tables stay where they are."""
+    """Imports cache scenes in a separate folder; the bundled tables stay where they are."""
     monkeypatch.setattr(importer, "_cache_folder", lambda root: tmp_path / "parts")
 
 
@@ -93,7 +93,7 @@ def write_features(place: Path) -> None:
             file.create_dataset(key, data=np.ones((512, 7, 7), np.float32), compression="gzip")
 
 
-def test_an_import_that_was_stopped_goes_on_where_it_was(
+def test_an_interrupted_import_continues_where_it_stopped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever stops it: a scene is read once until all is written, and is then forgotten."""

@@ -1,4 +1,4 @@
-"""The command: what it writes, and one clear line where it cannot."""
+"""The command: what it writes, and one clear line on an error."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import pytest
 
 from experiments import scenes
 from tdanet_jax.scenes import SceneTables
+from tests.experiments.test_data import fails
 from tests.scenes.test_metadata import DOCUMENT
 from tests.support.command import TINY
 from tests.support.pages import block
@@ -58,7 +59,7 @@ def test_own_rooms_as_the_page_shows_them(
         assert {json.loads(row)["scene"] for row in rows} == {"Office"}
 
 
-def test_rooms_that_no_split_uses_and_words_without_vectors_are_said(
+def test_unused_rooms_and_missing_word_vectors_are_reported(
     scene_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     named = {**DOCUMENT, "name": "FloorPlan5"}
@@ -84,7 +85,7 @@ def test_rooms_that_no_split_uses_and_words_without_vectors_are_said(
         ({"objectType": "Pillow", "far": 9.0}, "be evaluated in"),
     ],
 )
-def test_rooms_that_hold_no_target_are_said(
+def test_rooms_without_targets_are_reported(
     scene_file: Path, capsys: pytest.CaptureFixture[str], change: dict[str, Any], useless: str
 ) -> None:
     """Training would fail in them."""
@@ -116,7 +117,7 @@ def test_more_classes_than_can_be_numbered(
     ]
     scene_file.write_text(json.dumps({**DOCUMENT, "objects": things}))
     out = scene_file.with_name("lab.npz")
-    message = fails(["import", str(scene_file), "--out", str(out)], capsys)
+    message = fails(scenes, ["import", str(scene_file), "--out", str(out)], capsys)
     assert "lab.json: 128 classes, more than 127" in message
     assert not out.exists()
 
@@ -139,27 +140,21 @@ def test_inspect_own_and_bundled_rooms(scene_file: Path) -> None:
     scenes.main(["inspect", "FloorPlan430", *pose])
 
 
-def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    with pytest.raises(SystemExit) as stop:
-        scenes.main(arguments)
-    assert stop.value.code == 2
-    message = capsys.readouterr().err
-    assert message.startswith("error: ")
-    assert message.count("\n") == 1
-    return message
-
-
 def test_bad_input(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     here = scene_file.parent
-    assert "FloorPlan0" in fails(["inspect", "FloorPlan0"], capsys)
+    assert "FloorPlan0" in fails(scenes, ["inspect", "FloorPlan0"], capsys)
     pose = ["--position", "0", "0", "--rotation", "50", "--out", str(here / "a.png")]
-    assert "50" in fails(["inspect", "FloorPlan1", *pose], capsys)
-    assert "nope.json" in fails(["import", str(here / "nope.json"), "--out", "x"], capsys)
-    assert "lab.json" in fails(["import", str(scene_file), "--out", str(scene_file)], capsys)
+    assert "50" in fails(scenes, ["inspect", "FloorPlan1", *pose], capsys)
+    assert "nope.json" in fails(scenes, ["import", str(here / "nope.json"), "--out", "x"], capsys)
+    assert "lab.json" in fails(
+        scenes, ["import", str(scene_file), "--out", str(scene_file)], capsys
+    )
     (here / "bad.json").write_text(json.dumps({**DOCUMENT, "objects": []}))
     out = here / "bad.npz"
-    assert "Lab: no objects" in fails(["import", str(here / "bad.json"), "--out", str(out)], capsys)
-    assert "FloorPlan1=hall" in fails(["collect", "FloorPlan1=hall"], capsys)
+    assert "Lab: no objects" in fails(
+        scenes, ["import", str(here / "bad.json"), "--out", str(out)], capsys
+    )
+    assert "FloorPlan1=hall" in fails(scenes, ["collect", "FloorPlan1=hall"], capsys)
     assert sorted(p.name for p in here.iterdir()) == ["bad.json", "lab.json"]
 
 

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all."""
+"""Atomic file writes."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_an_error_leaves_the_old_file_and_nothing_else(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_was_half_written_is_removed(tmp_path: Path) -> None:
+def test_partial_files_are_removed(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text("whole")
     (tmp_path / f"{files.PARTIAL}b.json").write_text("half")
     (tmp_path / f"{files.PARTIAL}7" / "state").mkdir(parents=True)
@@ -51,7 +51,7 @@ def test_what_was_half_written_is_removed(tmp_path: Path) -> None:
     assert files.remove_partial(tmp_path / "missing") == []
 
 
-def test_what_a_killed_process_had_half_written_of_a_file_is_removed(tmp_path: Path) -> None:
+def test_partial_files_of_killed_processes_are_removed(tmp_path: Path) -> None:
     killed = subprocess.Popen([sys.executable, "-c", ""])
     killed.wait()
     begun = files.PARTIAL + str(killed.pid)

@@ -96,7 +96,7 @@ def start_building(folder: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True)
 
 
-def test_of_processes_at_once_one_builds_and_the_others_wait(tmp_path: Path) -> None:
+def test_one_of_several_processes_builds_and_the_others_wait(tmp_path: Path) -> None:
     running = [start_building(tmp_path) for _ in range(3)]
     said = [process.communicate(timeout=120) for process in running]
     assert [process.returncode for process in running] == [0, 0, 0]
@@ -108,7 +108,7 @@ def test_of_processes_at_once_one_builds_and_the_others_wait(tmp_path: Path) -> 
     assert len(files_of(tmp_path)) == 2
 
 
-def test_a_builder_that_is_killed_leaves_no_lock_and_no_litter(tmp_path: Path) -> None:
+def test_a_killed_builder_leaves_no_lock_and_no_partial_file(tmp_path: Path) -> None:
     killed = start_building(tmp_path)
     assert killed.stdout is not None
     assert killed.stdout.readline() == "building\n"
@@ -124,9 +124,7 @@ def files_of(folder: Path) -> list[Path]:
     return [path for path in folder.iterdir() if path.name != files.LOCK_FILE]
 
 
-def test_what_nobody_has_used_for_long_is_removed(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unused_files_are_removed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """When tables are stored: other tables and parts of imports, and nothing else."""
     before = time.time() - 86400 * (cache.UNUSED_DAYS + 1)
     folder.mkdir()

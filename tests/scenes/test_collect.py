@@ -1,4 +1,4 @@
-"""The collector against a controller that only pretends."""
+"""The collector with a fake controller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of rooms: what goes in comes out, and broken ones are refused in one line."""
+"""Files of rooms: saved and loaded again, and broken ones refused in one line."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ BREAKS: list[tuple[str, Any]] = [
 
 
 @pytest.mark.parametrize("case", range(len(BREAKS)))
-def test_numbers_that_contradict_each_other(rooms: SceneTables, tmp_path: Path, case: int) -> None:
+def test_inconsistent_arrays_are_refused(rooms: SceneTables, tmp_path: Path, case: int) -> None:
     name, change = BREAKS[case]
     broken = dataclasses.replace(rooms, **{name: change(getattr(rooms, name))})
     broken.save(tmp_path / "rooms.npz")
@@ -91,9 +91,7 @@ def notes(**values: Any) -> np.ndarray:
     return np.frombuffer(json.dumps(whole).encode(), np.uint8)
 
 
-def test_files_that_were_written_before_rooms_could_say_what_they_are_for(
-    rooms: SceneTables, tmp_path: Path
-) -> None:
+def test_older_files_without_parts_are_read(rooms: SceneTables, tmp_path: Path) -> None:
     path, empty = tmp_path / "rooms.npz", np.zeros((0, 0), np.float32)
     archive.write(path, {**rooms.to_arrays(), "extras/notes": notes(), "extras/adjacency": empty})
     extras = dataset.load_rooms(path).extras
@@ -101,7 +99,7 @@ def test_files_that_were_written_before_rooms_could_say_what_they_are_for(
     assert extras.parts == {}
 
 
-def test_rooms_that_say_what_they_are_for() -> None:
+def test_rooms_with_a_part_of_their_own() -> None:
     """Own names and iTHOR's, what is said before what the name says; validation takes a fifth."""
     corridor = toy.corridor()
     kinds = {"FloorPlan1": 0, "FloorPlan2": 0, "FloorPlan30": 0, "Attic": 2, "Den": 0, "Hall": 0}

@@ -11,7 +11,7 @@ from tdanet_jax.scenes import SceneError, floor_plan, tabulation
 from tests.support import toy
 
 
-def test_outlines_of_the_boxes_of_a_room_of_ones_own():
+def test_outlines_of_the_boxes_in_a_custom_room():
     mug = toy.thing("Mug", (1.0, 1.0, 2.0), (0.2, 0.1, 0.4))
     sofa = toy.thing("Sofa", (-1.0, 0.5, 0.0), (1.0, 1.0, 2.0))
     built = tabulation.build([toy.room(toy.line(3), mug, sofa)])

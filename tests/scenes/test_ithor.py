@@ -22,7 +22,7 @@ from tdanet_jax.splits import SCENE_NUMBERS
 from tdanet_jax.tools import build_assets
 from tdanet_jax.vocabulary import IGNORED, ROOM_TYPES, VISIBILITY_DISTANCE
 
-WHEELS = os.environ.get("TDANET_WHEELS")  # folder with the wheels of bundle.SOURCES
+WHEELS = os.environ.get("TDANET_WHEELS")  # folder with the wheels of build_assets.SOURCES
 needs_wheels = pytest.mark.skipif(not WHEELS, reason="TDANET_WHEELS names no folder of wheels")
 
 

@@ -136,7 +136,7 @@ def test_rules(tmp_path: Path, path: list[Any], value: Any, message: str | None)
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", "[1]", "3", "null", "[" * 100_000])
-def test_files_that_hold_no_scene(tmp_path: Path, content: str) -> None:
+def test_files_without_a_scene(tmp_path: Path, content: str) -> None:
     with pytest.raises(SceneError, match=r"scenes\.json") as error:
         read(tmp_path, content)
     assert "\n" not in str(error.value)

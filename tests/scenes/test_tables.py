@@ -1,4 +1,4 @@
-"""The tables' invariants, their subsets, and their way to disk and back."""
+"""Invariants of scene tables, their subsets, and files of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tdanet_jax.scenes.visibility import geometry
 from tdanet_jax.vocabulary import ALL_TARGETS
 from tests.support import toy
 
-# Of the bundled rooms. A change means that every published number has to be measured anew.
+# Of the bundled rooms. A change means that every published number has to be measured again.
 DATA_VERSION = "d4909be88f83"
 
 
@@ -42,7 +42,7 @@ def test_states_of_poses() -> None:
             t.nearest_state(0, 0, 0, rotation, horizon)
 
 
-def test_the_nearest_point_is_that_as_the_crow_flies() -> None:
+def test_the_nearest_point_is_by_euclidean_distance() -> None:
     """And not by the longer of its two sides: 0.28 m along z, or 0.25 m across and 0.22 m along."""
     t = tabulation.build([toy.room(toy.points((0.0, 0.0), (0.25, 0.5)), toy.corridor().objects[0])])
     assert t.nearest_state(0, 0.0, 0.28, 0) == 0

@@ -11,7 +11,7 @@ from tdanet_jax.scenes.visibility.rules import RULES
 from tests.support import toy
 
 
-def test_however_many_rooms_are_computed_at_once_the_tables_are_the_same(
+def test_tables_do_not_depend_on_the_number_of_threads(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     versions = set()

@@ -1,4 +1,4 @@
-"""Small rooms made by hand or at random, as scene tables with arrays that one can read."""
+"""Small rooms made by hand or at random, as scene tables with readable arrays."""
 
 from __future__ import annotations
 

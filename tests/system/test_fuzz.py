@@ -1,4 +1,4 @@
-"""Mutated files: whatever is wrong with a file from outside ends in one clear line.
+"""Mutated files: whatever is wrong with an untrusted file ends in one clear line.
 
 The fast tier tries a few hundred mutations, `pytest -m slow tests/system/test_fuzz.py` 12,000.
 """

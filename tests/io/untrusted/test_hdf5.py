@@ -1,4 +1,4 @@
-"""HDF5 from outside."""
+"""Untrusted HDF5 files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ h5py = pytest.importorskip("h5py")
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """A good dataset, and beside it everything that is refused."""
+    """A good dataset, and next to it everything that is refused."""
     with h5py.File(tmp_path / "other.h5", "w") as other:
         other["secret"] = np.zeros(3)
     (tmp_path / "raw").write_bytes(bytes(64))
@@ -59,7 +59,7 @@ def test_what_is_read(path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"text", b"\x89HDF\r\n\x1a\n" + bytes(600)])
-def test_what_is_no_hdf5(tmp_path: Path, content: bytes) -> None:
+def test_what_is_not_hdf5(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "b.h5"
     path.write_bytes(content)
     with pytest.raises(FileError, match=r"b\.h5: not a readable HDF5 file"), hdf5.opened(path):

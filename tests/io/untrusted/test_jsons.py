@@ -1,4 +1,4 @@
-"""JSON from outside."""
+"""Untrusted JSON files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_members_are_those_of_the_object(
     ["", "{", '{"a": 1', '{"a": 1,', '{"a": 1,}', '{"a" 1}', '{"a": NaN}', '{"a": -Infinity}',
      '{"a": 1} {}', "[1]", '{1: 2}', '{"a": ' + "[" * 100_000, '{"a": ' + "9" * 5000 + "}"],
 )  # fmt: skip
-def test_what_is_no_json_object_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+def test_what_is_not_a_json_object_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.json"
     path.write_text(text)
     with pytest.raises(FileError, match=r"a\.json: not ") as error:

@@ -1,4 +1,4 @@
-"""Archives of arrays from outside."""
+"""Untrusted npz archives."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_arrays_come_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["../a.npy", "/etc/a.npy", "a/../../b.npy", "a\\b.npy", "a.txt"])
-def test_names_of_other_places(tmp_path: Path, name: str) -> None:
+def test_names_outside_the_archive(tmp_path: Path, name: str) -> None:
     path = packed(tmp_path / "a.npz", **{name: npy(np.zeros(3))})
     with pytest.raises(FileError, match=r"a\.npz: .* is not the name of an array"):
         npz.read(path)

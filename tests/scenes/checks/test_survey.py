@@ -1,4 +1,4 @@
-"""What is out of reach is found, with its reason."""
+"""The survey of rooms: unreachable targets with their reasons, disconnected points."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def rooms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rooms:
     return importer.read_folder(scenes, lambda share, line: None)
 
 
-def test_what_lies_beside_the_scenes_is_found(rooms: Rooms) -> None:
+def test_extras_next_to_the_scenes_are_found(rooms: Rooms) -> None:
     found = rooms.extras
     assert found is not None
     assert found.parents == {"kitchen": {"Mug": {"TableTop": 0.25, "Sink": 0.5, "Toaster": 0.4}}}

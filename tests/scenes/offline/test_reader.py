@@ -141,7 +141,7 @@ def test_raw_metadata_in_place_of_the_map(folder: Path) -> None:
     assert "metadata.json (3 objects)" in after.found
 
 
-def test_the_name_with_the_distance_goes_first(folder: Path) -> None:
+def test_the_file_named_with_the_distance_is_preferred(folder: Path) -> None:
     (folder / "visible_object_map_1.5.json").write_text(json.dumps({MUG: []}))
     assert "visible_object_map_1.5.json (1 objects)" in read(folder).found
 
@@ -154,7 +154,7 @@ def test_without_boxes_there_is_visibility_alone(folder: Path) -> None:
     assert "no objects_bb.json, so no detections" in data.noted
 
 
-def test_keys_with_and_without_a_sign_are_one_state(folder: Path) -> None:
+def test_keys_with_and_without_a_sign_are_equal(folder: Path) -> None:
     change(folder, "objects_bb.json", lambda boxes: boxes.update({"0.00|0.50|0|0": {}}))
     before = read(folder)
     change(folder, "visible_object_map.json", lambda seen: seen.update({MUG: ["0.00|0.50|0|0"]}))

@@ -1,4 +1,4 @@
-"""Out and in again: the folder that we write holds what the tables hold, in the layout's terms."""
+"""Round trips through the original layout: the exported folder contains what the tables do."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def assert_equal(ours: SceneTables, theirs: SceneTables) -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_out_and_in_is_the_identity(some_rooms: SceneTables, tmp_path: Path) -> None:
+def test_export_and_import_are_the_identity(some_rooms: SceneTables, tmp_path: Path) -> None:
     rooms = some_rooms.subset(["FloorPlan29", "FloorPlan321", "FloorPlan428"])
     exporter.write_folder(rooms, tmp_path / "out", silent)
     back = importer.read_folder(tmp_path / "out", silent).tables
@@ -113,7 +113,7 @@ def test_random_rooms(tmp_path_factory: pytest.TempPathFactory, seed: int) -> No
     assert detections(back, exact=False) == detections(room, exact=False)
 
 
-def test_imported_rooms_go_out_and_in_again(tmp_path: Path) -> None:
+def test_imported_rooms_survive_export_and_import(tmp_path: Path) -> None:
     """Nameless objects and those without a box or a place included."""
     first = importer.read_folder(original.write_all(tmp_path / "original"), silent).tables
     exporter.write_folder(first, tmp_path / "out", silent)
@@ -206,7 +206,7 @@ def test_broken_features_leave_nothing_behind(some_rooms: SceneTables, tmp_path:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out"]
 
 
-def test_parents_go_out_and_in(ithor: SceneTables) -> None:
+def test_parents_survive_export_and_import(ithor: SceneTables) -> None:
     split = make_split("22/0")
     train = ithor.subset(split.train_scenes)
     ours, theirs = find_parents(train, TARGETS), named_parents(ithor)
@@ -216,7 +216,9 @@ def test_parents_go_out_and_in(ithor: SceneTables) -> None:
         assert set(ours.classes[goal]) == set(back.classes[goal])
 
 
-def test_a_stopped_import_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_import_interrupted_while_reading_continues(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source = original.write_all(tmp_path / "original")
     whole = importer.read_folder(source, silent).tables
     importer.clear_cache(source)
@@ -237,7 +239,7 @@ def test_a_stopped_import_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert_equal(whole, back)
 
 
-def test_scenes_that_changed_since_are_read_anew(
+def test_scenes_that_changed_are_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = original.write_all(tmp_path / "original") / "FloorPlan1"
@@ -259,7 +261,7 @@ def test_scenes_that_changed_since_are_read_anew(
         assert len(room.row_object) == 6
 
 
-def test_folders_that_hold_no_scenes(tmp_path: Path) -> None:
+def test_folders_without_scenes(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no folders FloorPlan1 to FloorPlan430"):
         layout.find_root(tmp_path / "nowhere")
     (tmp_path / "FloorPlan501").mkdir()
@@ -272,7 +274,7 @@ def test_folders_that_hold_no_scenes(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_all_rooms_out_and_in_are_the_bundled_tables(ithor: SceneTables, tmp_path: Path) -> None:
+def test_all_rooms_survive_export_and_import(ithor: SceneTables, tmp_path: Path) -> None:
     """To the last bit: the hash over all fields is the same."""
     exporter.write_folder(ithor, tmp_path / "out", silent)
     back = importer.read_folder(tmp_path / "out", silent).tables

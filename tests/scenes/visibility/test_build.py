@@ -125,7 +125,7 @@ def test_fronts_look_at_the_room() -> None:
     assert "Sofa" in seen(toy.room(spots, sofa), 2, 4)
 
 
-def test_counters_end_where_one_can_stand() -> None:
+def test_counters_end_where_an_agent_can_stand() -> None:
     counter = toy.thing("CounterTop", (0.0, 0.9, 1.0), (3.0, 0.04, 3.0))
     scene = toy.room(toy.line(3), counter)
     patches = patches_of(scene, RULES)
