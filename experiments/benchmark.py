@@ -1,10 +1,10 @@
-"""Measures this machine and the software on it; compile time and run time apart.
+"""Measures speed on this machine, with compilation and run time apart.
 
     python -m experiments.benchmark --out benchmark.jsonl
 
-Every figure is the median over repetitions. Shares of the peak count 6 floating-point operations
-(forward and backward) per multiply-accumulate of one forward step, by hand formula: work that is
-done twice earns nothing. The peak is the best rate of a float32 product of batch x 1024 by
+Every value is the median over repetitions. Shares of the peak count 6 floating-point operations
+(forward and backward) for each multiply-accumulate of a forward step, by a formula; work that is
+done twice counts once. The peak is the best rate of a float32 product of batch x 1024 by
 1024 x 2048, measured in the same run.
 """
 
@@ -14,6 +14,11 @@ import contextlib
 import dataclasses
 import json
 import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,11 +37,12 @@ Part = Literal[
     "tables", "import", "startup", "machine", "environment", "rollout", "update", "evaluation",
     "decision",
 ]  # fmt: skip
+Precision = Literal["auto", "float32", "bfloat16"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Measures env, rollout, update, evaluation and one decision on this machine."""
+    """Measures the speed of environment, rollout, update, evaluation and decisions."""
 
     parts: tuple[Part, ...] = get_args(Part)
     """What to measure."""
@@ -45,7 +51,7 @@ class Command:
     batches: tuple[int, ...] = (256, 512, 1024)
     """Numbers of environments in the `rollout` and `update` parts."""
     precisions: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
-    """Operands of the products in the `rollout` and `update` parts."""
+    """Precision of the matrix products in the `rollout` and `update` parts."""
     networks: tuple[int, ...] = (1,)
     """Numbers of networks that are evaluated in one call; 20 is a run's history."""
     checkpoint: Path | None = None
@@ -53,23 +59,25 @@ class Command:
     models: tuple[str, ...] = ("tdanet",)
     """Models of the `rollout`, `update` and `decision` parts."""
     odometry: bool = False
-    """Those models sense their own way, as with the flag of the training command."""
+    """Give these models odometry, as the training command does."""
     triangulation: bool = False
-    """And, with --odometry, where their target is."""
+    """With --odometry, also give them triangulation."""
     data: str | None = None
-    """File of rooms that `experiments.scenes import` wrote, in place of the bundled ones."""
+    """File of rooms that `experiments.scenes import` wrote, instead of the bundled ones."""
     devices: int = 1
     """Devices that the environments of the `environment` part are split over; a CPU is split into
     as many."""
     repeats: int = 5
-    """Timed repetitions of each figure."""
+    """Repetitions of each measurement."""
     out: Path | None = None
-    """File for the figures, one JSON object per line, written as they come; must not exist."""
+    """File for the results, one JSON object per line, written as they come; must not exist."""
 
-    @property
-    def network(self) -> NetworkConfig:
-        """What the models sense."""
-        return NetworkConfig(odometry=self.odometry, triangulation=self.triangulation)
+    def config(self, model: str, precision: Precision = "auto") -> TrainConfig:
+        """The run whose model and rooms are measured."""
+        network = NetworkConfig(
+            odometry=self.odometry, triangulation=self.triangulation, precision=precision
+        )
+        return TrainConfig(model=model, network=network, data=self.data)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -86,18 +94,16 @@ def main(arguments: list[str] | None = None) -> None:
             networks=command.networks,
         )
         for name in command.models:
-            TrainConfig(model=name, network=command.network).check()
+            command.config(name).check()
         if command.odometry and not {"rollout", "update", "decision"} & set(command.parts):
             fail("--odometry: none of the --parts has a model; choose rollout, update or decision")
         if command.checkpoint is not None:
             from tdanet_jax.evaluation import saved_networks
 
-            saved_networks.find(
-                command.checkpoint
-            )  # what is not there is noticed now, not after minutes
+            saved_networks.find(command.checkpoint)  # an error shows now, not after minutes
         rows = []
         with contextlib.nullcontext() if command.out is None else command.out.open("x") as file:
-            for row in figures(command):
+            for row in measure(command):
                 rows.append(row)
                 line = json.dumps(row)
                 console.print(line)
@@ -107,8 +113,8 @@ def main(arguments: list[str] | None = None) -> None:
         console.print(as_table(rows))
 
 
-def figures(command: Command) -> Iterator[Row]:
-    """All figures that were asked for, one row each."""
+def measure(command: Command) -> Iterator[Row]:
+    """All results that were asked for, one row each."""
     import jax
 
     from tdanet_jax.task import load_task
@@ -116,12 +122,8 @@ def figures(command: Command) -> Iterator[Row]:
     from tdanet_jax.training import devices
 
     mesh = devices.connect(command.devices)
-    yield {
-        "part": "start",
-        "device": str(jax.devices()[0]),
-        "processor": benchmarking.processor(),
-        "jax": jax.__version__,
-    }
+    machine = {"processor": benchmarking.processor(), "jax": jax.__version__}
+    yield {"part": "start", "device": str(jax.devices()[0]), **machine}
     if "tables" in command.parts:
         yield tables_row()
     task = load_task(TrainConfig(data=command.data))
@@ -131,9 +133,9 @@ def figures(command: Command) -> Iterator[Row]:
         yield startup_row()
     peak = None
     if "machine" in command.parts:
-        machine = benchmarking.machine_row(command.repeats)
-        peak = machine["float32_gflops"]
-        yield machine
+        row = benchmarking.machine_row(command.repeats)
+        peak = row["float32_gflops"]
+        yield row
     if "environment" in command.parts:
         for count in command.environments:
             for observed in (False, True):
@@ -141,53 +143,45 @@ def figures(command: Command) -> Iterator[Row]:
     if "evaluation" in command.parts:
         for networks in command.networks:
             yield benchmarking.evaluation_row(command.checkpoint, task, networks, command.repeats)
+    sensors = {"odometry": command.odometry, "triangulation": command.triangulation}
     for name in command.models:
         for row in model_rows(command, name, peak):
-            senses = {"odometry": command.odometry, "triangulation": command.triangulation}
-            yield {"part": row.pop("part"), "model": name, **senses, **row}
+            yield {"part": row.pop("part"), "model": name, **sensors, **row}
 
 
 def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]:
-    """What was asked for of a model: acting, updates, and one decision.
+    """The results of a model: acting, updates, and one decision.
 
     Args:
-      peak: of float32 products, GFLOP/s; None if it was not measured.
+      peak: rate of float32 products, GFLOP/s; None if it was not measured.
     """
     import jax.numpy as jnp
 
     from tdanet_jax.task import load_task
     from tdanet_jax.tools import benchmarking
 
-    acts = {"rollout", "update"} & set(command.parts)
-    measured = set()
-    for asked in command.precisions if acts else ():
-        network = dataclasses.replace(command.network, precision=asked)
-        task = load_task(TrainConfig(model=name, network=network, data=command.data))
+    repeats, measured = command.repeats, set()
+    for asked in command.precisions if {"rollout", "update"} & set(command.parts) else ():
+        task = load_task(command.config(name, asked))
         precision = jnp.dtype(task.model.dtype).name
-        if precision in measured:  # some models multiply in float32, whatever is asked for
+        if precision in measured:  # some models always multiply in float32
             continue
         measured.add(precision)
         for count in command.batches:
             if "rollout" in command.parts:
-                yield {
-                    **benchmarking.rollout_row(task, count, command.repeats),
-                    "precision": precision,
-                }
+                yield benchmarking.rollout_row(task, count, repeats) | {"precision": precision}
             if "update" in command.parts:
-                row = benchmarking.update_row(task, count, command.repeats)
+                row = benchmarking.update_row(task, count, repeats)
                 share = benchmarking.share_of_peak(task, row, peak) if name == "tdanet" else {}
                 yield {**row, **share, "precision": precision}
     if "decision" in command.parts:
-        task = load_task(TrainConfig(model=name, network=command.network, data=command.data))
+        task = load_task(command.config(name))
         for count in (1, 1024):
-            yield benchmarking.decision_row(task, count, command.repeats)
+            yield benchmarking.decision_row(task, count, repeats)
 
 
 def tables_row() -> Row:
-    """From the bundled rooms to tables, to a file, and from the file; peak memory so far."""
-    import resource
-    import tempfile
-
+    """Time to compute the tables of the bundled rooms, to save and to load them; peak memory."""
     from tdanet_jax.scenes import ithor
     from tdanet_jax.scenes.tables import SceneTables
     from tdanet_jax.scenes.tabulation import build
@@ -215,13 +209,10 @@ def tables_row() -> Row:
 
 
 def import_row(task: Task) -> Row:
-    """Rooms out to the original offline layout, and in again by the command that a user types;
-    the command's own peak memory."""
-    import resource
-    import subprocess
-    import sys
-    import tempfile
+    """Time to export the rooms to the original offline layout and to import them again.
 
+    The import is the command that a user types; the peak memory is that of its process.
+    """
     from tdanet_jax.scenes.offline import exporter
 
     with tempfile.TemporaryDirectory() as place:
@@ -247,13 +238,10 @@ def import_row(task: Task) -> Row:
 
 
 def startup_row() -> Row:
-    """From typing the training command to its first update, the rooms' tables being cached: with
-    nothing compiled, and with the compiled programs of the first start; and `--help`."""
-    import shutil
-    import subprocess
-    import sys
-    import tempfile
+    """Time from the start of the training command to its first update, and of `--help`.
 
+    The rooms' tables are cached; once nothing is compiled, once the first start has compiled it.
+    """
     from tdanet_jax.scenes import cache
 
     train = [sys.executable, "-m", "experiments.train_zero_shot"]
@@ -282,16 +270,16 @@ def startup_row() -> Row:
 
 
 def as_table(rows: list[Row]) -> Table:
-    """All rows as one table: the part, its setting, and its figures."""
-    table = Table("part", "setting", "figures")
+    """All rows as one table: the part, its setting, and its results."""
+    table = Table("part", "setting", "results")
     settings = (
         "environments", "devices", "observations", "precision", "model", "odometry",
         "triangulation", "batch", "networks", "episodes",
     )  # fmt: skip
     for row in rows:
         setting = ", ".join(f"{k} {row[k]}" for k in settings if k in row)
-        figures = ", ".join(f"{k} {v}" for k, v in row.items() if k not in (*settings, "part"))
-        table.add_row(row["part"], setting, figures)
+        results = ", ".join(f"{k} {v}" for k, v in row.items() if k not in (*settings, "part"))
+        table.add_row(row["part"], setting, results)
     return table
 
 

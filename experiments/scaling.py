@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from experiments.console import (
     check_positive,
@@ -26,10 +26,8 @@ from tdanet_jax.config import TrainConfig
 
 if TYPE_CHECKING:
     import jax
-    import numpy as np
 
     from tdanet_jax.env.types import EnvParams
-    from tdanet_jax.scenes import SceneTables
     from tdanet_jax.task import Task
     from tdanet_jax.tools.benchmarking import Row
 from tdanet_jax.io import files
@@ -126,55 +124,18 @@ def with_rooms(task: Task, count: int) -> EnvParams:
     from tdanet_jax.env.params import make_params
     from tdanet_jax.env.reward import Parents
     from tdanet_jax.observation_spec import ObservationSpec
+    from tdanet_jax.scenes.tabulation import join
 
     names = task.split.train_scenes
     per_type = len(names) // 4
-    by_turn = sorted(
-        names, key=lambda name: names.index(name) % per_type
-    )  # all types from the start
     parts = [task.tables.subset(names)] * (count // len(names))
-    if count % len(names):
+    if count % len(names):  # rooms of all types
+        by_turn = sorted(names, key=lambda name: names.index(name) % per_type)
         parts.append(task.tables.subset(by_turn[: count % len(names)]))
     old = task.train_params
     parents = Parents(np.asarray(old.parent_class), np.asarray(old.parent_reward))
-    tables = joined(parts)
-    limits = old.step_limit.tolist()
+    tables, limits = join(parts, task.tables.classes), old.step_limit.tolist()
     return make_params(tables, task.split.seen, parents, limits, ObservationSpec())
-
-
-def joined(parts: list[SceneTables]) -> SceneTables:
-    """The rooms of all parts, which share classes and targets, one after the other."""
-    import numpy as np
-
-    def stacked(name: str, first: Callable[[SceneTables], int] | None = None) -> np.ndarray:
-        """A field of all parts; indices are moved by the sizes of the parts before."""
-        moved, offset = [], 0
-        for part in parts:
-            values = getattr(part, name)
-            moved.append(values if first is None else values + np.asarray(offset, values.dtype))
-            offset += 0 if first is None else first(part)
-        return np.concatenate(moved)
-
-    def count_scenes(part: SceneTables) -> int:
-        return len(part.scenes)
-
-    def count_objects(part: SceneTables) -> int:
-        return len(part.object_class)
-
-    counts = np.concatenate([np.diff(part.row_start) for part in parts])
-    names = ("room_type", "position", "row_box", "row_visible", "object_class", "object_box")
-    plain: dict[str, Any] = {name: stacked(name) for name in (*names, "distance", "raster")}
-    return dataclasses.replace(
-        parts[0],
-        scenes=tuple(f"{name}-{i}" for i, part in enumerate(parts) for name in part.scenes),
-        object_id=tuple(name for part in parts for name in part.object_id),
-        position_scene=stacked("position_scene", count_scenes),
-        object_scene=stacked("object_scene", count_scenes),
-        next_position=stacked("next_position", lambda part: len(part.position)),
-        row_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
-        row_object=stacked("row_object", count_objects),
-        **plain,
-    )
 
 
 def with_detections(params: EnvParams, rows: int) -> EnvParams:

@@ -40,7 +40,7 @@ RUN_FILES = {
         (["--out=x", "--vmap-seeds", "--minutes", "1"], "--vmap-seeds needs a budget in --steps"),
         (
             ["--out=x", "--models", "tdanet", "ssnet", "--preset", "best"],
-            "ssnet is not shown a box",
+            "which ssnet does not show",
         ),
         (["--out=x", "--models", "tdanet", "no.such"], "--model no.such: No module named 'no'"),
         (["--out=x", "--report-only", "--steps", "5"], "--report-only trains nothing"),
