@@ -1,6 +1,6 @@
-"""What this machine and each part of the software on it achieve; compile and run time apart.
+"""Speed of this machine and of each part of the software, with compilation and run time apart.
 
-Every figure is the median over repetitions. A function returns a row of figures by name.
+Every value is the median over repetitions. Each function returns a row of results by name.
 """
 
 from __future__ import annotations
@@ -32,9 +32,12 @@ Row = dict[str, Any]
 
 
 def timed(call: Callable[[], Any], repeats: int, inner: int = 1) -> tuple[float, float]:
-    """Seconds of the first call (compilation included) and the median of later ones.
+    """Seconds of the first call, including compilation, and the median of later ones.
 
-    A repetition makes `inner` calls; the median is per call.
+    Args:
+      call: what to time.
+      repeats: number of repetitions.
+      inner: calls in a repetition; the median is per call.
     """
     began = time.perf_counter()
     jax.block_until_ready(call())
@@ -50,7 +53,7 @@ def timed(call: Callable[[], Any], repeats: int, inner: int = 1) -> tuple[float,
 
 
 def processor() -> str:
-    """The processor's name, as far as the system tells."""
+    """The processor's name, if the system tells it."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text().splitlines():
@@ -60,14 +63,14 @@ def processor() -> str:
 
 
 def machine_row(repeats: int) -> Row:
-    """The machine's own limits: matrix products and memory."""
+    """The limits of the machine: rate of matrix products, and memory bandwidth."""
     times = 5 if jax.default_backend() == "cpu" else 200  # an accelerator takes microseconds
 
     @jax.jit
     def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
         def again(_: jax.Array, a: jax.Array) -> jax.Array:
             product = jnp.dot(a, b, preferred_element_type=jnp.float32)
-            # The next one waits for this one, and for all of it.
+            # The next product depends on all of this one.
             return (product[:, :1024] + product[:, 1024:]).astype(a.dtype)
 
         return jax.lax.fori_loop(0, times, again, a)
@@ -89,7 +92,7 @@ def machine_row(repeats: int) -> Row:
 
 
 def environment_row(task: Task, count: int, observed: bool, repeats: int, mesh: Mesh) -> Row:
-    """Random actions, auto-reset included; with `observed`, every detection is read."""
+    """Random actions with auto-reset; with `observed`, every observation is computed."""
     steps = 64
     params = jax.device_put(task.train_params, devices.everywhere(mesh))
 
@@ -113,7 +116,7 @@ def environment_row(task: Task, count: int, observed: bool, repeats: int, mesh: 
             state, following = split((state, following))
             return (state, following if observed else obs, total + reward), None
 
-        # What is carried is written in every step, and returned, so that it cannot be left out.
+        # Everything carried is written in every step and returned, so that XLA cannot drop it.
         obs = split(jax.vmap(dynamics.observe, (0, None))(state, params))
         total = split(jnp.zeros(count))
         (_, obs, total), _ = jax.lax.scan(body, (state, obs, total), jax.random.split(key, steps))
@@ -131,7 +134,7 @@ def environment_row(task: Task, count: int, observed: bool, repeats: int, mesh: 
 
 
 def rollout_row(task: Task, count: int, repeats: int) -> Row:
-    """Acting alone: environment, network and what the gradient needs later."""
+    """Acting alone: environment, network, and what the gradient will need."""
     model, config = task.model, LearnerConfig(num_envs=count)
     state = learner.init(jax.random.key(0), config, model, task.train_words, task.train_params)
 
@@ -152,13 +155,13 @@ def rollout_row(task: Task, count: int, repeats: int) -> Row:
 
 
 def update_row(task: Task, count: int, repeats: int) -> Row:
-    """Rollout, gradient and optimiser step, as the training command runs them."""
+    """Rollout, gradient and optimiser step, as in training."""
     cost = update_cost(task.model, task.train_words, task.train_params, count, repeats)
     return {"part": "update", **cost}
 
 
 def share_of_peak(task: Task, update: Row, peak: float | None) -> Row:
-    """Operations of TDANet's update by hand formula, and their share of the peak."""
+    """Operations of TDANet's update by the formula, and their share of the peak."""
     by_hand = 6 * tdanet_forward_macs(task.model, task.train_words.shape[1])
     gflops = by_hand * update["steps_per_second"] / 1e9
     return {
@@ -169,9 +172,9 @@ def share_of_peak(task: Task, update: Row, peak: float | None) -> Row:
 
 
 def tdanet_forward_macs(model: ActorCritic, words_width: int) -> int:
-    """Multiply-accumulates of one forward step of TDANet, by the sizes of its layers.
+    """Multiply-accumulates of one forward step of TDANet, from the sizes of its layers.
 
-    What is done once per update for the table of classes is not counted.
+    The work on the class table, once per update, is not counted.
     """
 
     width, hidden = model.encoder.width, model.hidden
@@ -187,9 +190,9 @@ def update_cost(
 ) -> Row:
     """Time and memory of an update of `count` environments, and XLA's count of its operations.
 
-    XLA counts the body of a loop once. The work of an update is in loops over the T steps, so its
-    count over the number of environments is that of one environment step, and what is done once
-    per update comes on top.
+    XLA counts the body of a loop once, and an update loops over its T steps. Its count divided by
+    the number of environments is thus that of one environment step, plus what is done once per
+    update.
     """
     config, updates = LearnerConfig(num_envs=count), 5
     chunk = learner.make_train(config, model, updates)
@@ -225,8 +228,11 @@ def evaluation_row(run: Path | None, task: Task, networks: int, repeats: int) ->
     """All episodes of a split with sampled actions, for several networks in one call.
 
     Args:
-      run: folder of a trained run, whose network plays; None takes an untrained one, which says
-        Done early and is done sooner.
+      run: folder of a trained run, whose network plays; None takes an untrained one, whose episodes
+        are shorter.
+      task: what an untrained network plays.
+      networks: number of networks.
+      repeats: number of repetitions.
     """
     if run is None:
         weights = task.model.initialise(jax.random.key(0), task.words)
