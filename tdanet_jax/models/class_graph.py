@@ -8,10 +8,14 @@ Another graph, such as that of an imported data set, can replace it.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from tdanet_jax.env.reward import NEAR
-from tdanet_jax.scenes.tables import SceneTables
+
+if TYPE_CHECKING:
+    from tdanet_jax.scenes.tables import SceneTables
 
 #: Fewest rooms that hold both classes of an edge.
 MIN_ROOMS = 2
