@@ -1,4 +1,4 @@
-"""Where the modules of version 0.1 are now: their old names work until 0.3, with a warning."""
+"""Where the modules of version 0.1 are now: the old names work until 0.3, with a warning."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import importlib
 import importlib.abc
 import importlib.machinery
 import importlib.util
+import pkgutil
 import sys
 import warnings
 from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
-#: Old module -> new module, below `tdanet_jax`.
+#: Old name -> new name, below `tdanet_jax`.
 MOVED = {
     "ai2thor": "agent.ai2thor",
     "assets": "io.assets",
@@ -24,6 +25,7 @@ MOVED = {
     "devices": "training.devices",
     "episode_lookup": "analysis.episode_lookup",
     "episodes": "evaluation.episodes",
+    "evaluation.evaluate_lists": "evaluation.rollout.evaluate_lists",
     "figures": "analysis.figures",
     "files": "io.files",
     "graph": "models.class_graph",
@@ -51,10 +53,10 @@ MOVED = {
 
 
 def attribute(name: str) -> Any:
-    """An old module, as an attribute of the package: `from tdanet_jax import episodes`."""
+    """What has moved, as an attribute of its old package: `from tdanet_jax import episodes`."""
     if name in MOVED:
-        return importlib.import_module(_warn(name, stacklevel=4))
-    raise AttributeError(f"module 'tdanet_jax' has no attribute {name!r}")
+        return pkgutil.resolve_name(_warn(name, stacklevel=4))
+    raise AttributeError(f"tdanet_jax has no {name}")
 
 
 def _warn(name: str, stacklevel: int) -> str:
@@ -66,7 +68,7 @@ def _warn(name: str, stacklevel: int) -> str:
 
 
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Finds old modules: gives the new one in their place."""
+    """Finds the new module under an old name."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None

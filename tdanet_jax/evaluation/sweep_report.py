@@ -259,7 +259,7 @@ def _costs(report: Report) -> Iterator[str]:
         ]
         yield f"| {' | '.join(cells)} |"
     yield from ("", f"Time of one decision for a batch of agents, on {report.machine}.")
-    yield "The paper's word vectors have 300 dimensions; here the input layers fit those of the run."
+    yield "The paper's word vectors have 300 dimensions; here, the input layers fit the run's."
 
 
 def _runs(report: Report) -> Iterator[str]:
