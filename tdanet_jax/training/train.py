@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from tdanet_jax import config as configs
 from tdanet_jax.analysis import figures
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.evaluation import episodes, policies, report, rollout
+from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.io import files
 from tdanet_jax.models.factory import unused_flags
 from tdanet_jax.task import Task, load_task, resolve
@@ -61,6 +62,7 @@ def train(
     mesh = devices.connect(device_count)
     devices.keep_compiled()
     task = load_task(config, callbacks.on_rooms)
+    lists = episodes.load(task.tables, task.split, task.extras)  # errors show before training
     for flag in () if resume else unused_flags(config, task.classes):
         callbacks.on_note(f"note: {flag} changes nothing for {config.model}")
     # What "auto" means here is part of the run: it continues with the same products elsewhere.
@@ -75,7 +77,7 @@ def train(
         callbacks.on_note(f"{run.title} -> {folder}")
         sink = tensorboard_sink(folder) if tensorboard and devices.is_lead() else None
         finished = _learn([run], ([row] for row in run.chunks()), callbacks, sink)
-        return _report(run, callbacks) if finished and devices.is_lead() else None
+        return _report(run, lists, callbacks) if finished and devices.is_lead() else None
 
 
 def train_together(members: Sequence[tuple[TrainConfig, Path]], callbacks: Callbacks) -> None:
@@ -87,6 +89,7 @@ def train_together(members: Sequence[tuple[TrainConfig, Path]], callbacks: Callb
     """
     with contextlib.ExitStack() as locks:
         task = load_task(members[0][0], callbacks.on_rooms)
+        lists = episodes.load(task.tables, task.split, task.extras)
         runs = []
         for config, folder in members:
             locks.enter_context(files.locked(folder))
@@ -95,7 +98,7 @@ def train_together(members: Sequence[tuple[TrainConfig, Path]], callbacks: Callb
             callbacks.on_note(f"{runs[-1].title} -> {folder}")
         if _learn(runs, chunks_together(runs), callbacks):
             for run in runs:
-                _report(run, callbacks)
+                _report(run, lists, callbacks)
 
 
 def resumed(folder: Path, budget: TrainConfig | None = None) -> TrainConfig:
@@ -152,12 +155,11 @@ def _learn(
     return True
 
 
-def _report(run: Run, callbacks: Callbacks) -> dict[str, Any]:
+def _report(run: Run, lists: Mapping[str, Episodes], callbacks: Callbacks) -> dict[str, Any]:
     """Evaluates a finished run; writes its learning curve and its results."""
     figures.learning_curve(read_metrics(run.folder), run.title, run.folder / "learning_curve.png")
     callbacks.on_note("evaluating ...")
     task, seed = run.task, run.config.seed
-    lists = episodes.load(task.tables, task.split, task.extras)
     policy = policies.network(run.model, task.words)
     weights = jax.device_get(run.state.params)
     played = rollout.evaluate_lists(policy, weights, task.eval_params, lists, seed)
