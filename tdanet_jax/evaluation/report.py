@@ -51,31 +51,19 @@ NEAR_SYNONYMS = {
 
 @dataclasses.dataclass(frozen=True)
 class Provenance:
-    """Where a result comes from: the fields of `results.json` that are not results.
-
-    Attributes:
-      split, model: what was trained.
-      policy: how actions were chosen.
-      episodes_trained, steps: training episodes and environment steps.
-      seed: of the training; for policies without training, of the evaluation.
-      evaluation_seed: of the actions sampled in the test episodes.
-      data_version: of the scene tables in the evaluation.
-      data: file of their rooms, unless they are the bundled ones.
-      image: the image that the model is shown, if there is one.
-      sensors: names of the agent's sensors; the paper's agents have none.
-    """
+    """Where a result comes from: the fields of `results.json` that are not results."""
 
     split: str
     model: str
-    policy: str
+    policy: str  # how actions were chosen
     episodes_trained: int
-    seed: int
-    evaluation_seed: int
-    steps: int
-    data_version: str
-    data: str | None = None
-    image: str | None = None
-    sensors: tuple[str, ...] = ()
+    seed: int  # of the training; for policies without training, of the evaluation
+    evaluation_seed: int  # of the actions sampled in the test episodes
+    steps: int  # environment steps of the training
+    data_version: str  # of the scene tables in the evaluation
+    data: str | None = None  # file of their rooms, unless they are the bundled ones
+    image: str | None = None  # the image that the model is shown, if there is one
+    sensors: tuple[str, ...] = ()  # names of the agent's sensors; the paper's agents have none
 
     @classmethod
     def of(

@@ -32,19 +32,12 @@ TOGETHER = 20
 
 @dataclasses.dataclass(frozen=True)
 class SavedNetwork:
-    """A network on disk.
+    """A network on disk."""
 
-    Attributes:
-      run: its run's folder.
-      config: its run's configuration.
-      point: a file of the run's history, or None for its newest network.
-      data: file of rooms to evaluate in; None for those of its training.
-    """
-
-    run: Path
-    config: TrainConfig
-    point: Path | None = None
-    data: str | None = None
+    run: Path  # its run's folder
+    config: TrainConfig  # of its run
+    point: Path | None = None  # a file of the run's history, or None for its newest network
+    data: str | None = None  # file of rooms to evaluate in; None for those of its training
 
     @property
     def rooms(self) -> str | None:
@@ -58,18 +51,10 @@ class SavedNetwork:
 
 @dataclasses.dataclass(frozen=True)
 class Evaluated:
-    """A saved network and its evaluation.
-
-    Attributes:
-      saved: the network on disk.
-      snapshot: the progress of its run then; without the weights.
-      task: what it was evaluated on.
-      provenance: where its results come from.
-      played: its episodes by group.
-    """
+    """A saved network and its evaluation."""
 
     saved: SavedNetwork
-    snapshot: Snapshot
+    snapshot: Snapshot  # the progress of its run then; without the weights
     task: Task
     provenance: report.Provenance
     played: Played

@@ -82,19 +82,12 @@ def progress(folder: Path, config: TrainConfig) -> Literal["new", "begun", "fini
 
 @dataclasses.dataclass(frozen=True)
 class FinishedRun:
-    """A finished run.
-
-    Attributes:
-      folder: its folder.
-      config: its configuration.
-      results: the content of its `results.json`, and its settings.
-      seconds: training time; None if unknown.
-    """
+    """A finished run."""
 
     folder: Path
     config: TrainConfig
-    results: Result
-    seconds: float | None
+    results: Result  # the content of its `results.json`, and its settings
+    seconds: float | None  # training time; None if unknown
 
 
 def finished(folder: Path) -> FinishedRun:

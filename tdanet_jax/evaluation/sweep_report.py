@@ -20,38 +20,23 @@ PAPER_SPLITS = ("18/4", "14/8")
 
 @dataclasses.dataclass(frozen=True)
 class Cost:
-    """Size and speed of a model on this machine.
-
-    Attributes:
-      model: its name.
-      parameters: number of trained parameters; without word vectors.
-      milliseconds: time of a decision, by the number of agents that decide at once.
-    """
+    """Size and speed of a model on this machine."""
 
     model: str
-    parameters: int
-    milliseconds: Mapping[int, float]
+    parameters: int  # trained parameters, without word vectors
+    milliseconds: Mapping[int, float]  # of a decision, by batch size
 
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """The content of the report.
-
-    Attributes:
-      runs: the finished runs.
-      untrained: results of policies without training, one for each split and policy.
-      costs: by the runs' labels.
-      curves: learning curves by split.
-      machine: where the costs were measured.
-      code: the version of the code.
-    """
+    """The content of the report."""
 
     runs: Sequence[FinishedRun]
-    untrained: Sequence[Result]
-    costs: Mapping[str, Cost]
-    curves: Mapping[str, Sequence[Curve]]
-    machine: str
-    code: str
+    untrained: Sequence[Result]  # policies without training, one for each split and policy
+    costs: Mapping[str, Cost]  # by the runs' labels
+    curves: Mapping[str, Sequence[Curve]]  # by split
+    machine: str  # where the costs were measured
+    code: str  # the version of the code
 
     @property
     def splits(self) -> list[str]:

@@ -31,22 +31,14 @@ FORMAT = 2
 
 @dataclasses.dataclass(frozen=True)
 class Snapshot:
-    """A network at one moment of its training.
+    """A network at one moment of its training."""
 
-    Attributes:
-      weights: its parameters.
-      updates, episodes: updates and training episodes done.
-      seconds: training time.
-      point: which point of the history it is, from 1; 0 outside the history.
-      data_version: of the scene tables that it trained on.
-    """
-
-    weights: Any
-    updates: int
-    episodes: int
-    seconds: float
-    point: int
-    data_version: str
+    weights: Any  # its parameters
+    updates: int  # updates done
+    episodes: int  # training episodes done
+    seconds: float  # training time
+    point: int  # which point of the history it is, from 1; 0 outside the history
+    data_version: str  # of the scene tables that it trained on
 
 
 _WHERE = {field.name for field in dataclasses.fields(Snapshot)} - {"weights"}
