@@ -13,42 +13,26 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
+#: Modules that kept their names, by the packages in which they are now.
+_PACKAGES = {
+    "agent": "ai2thor",
+    "analysis": "attention episode_lookup figures pictures replay trace",
+    "env": "reward zero_shot",
+    "evaluation": "comparison episodes metrics paper policies report sweep",
+    "io": "assets files untrusted",
+    "models": "classes",
+    "sensors": "detections odometry triangulation",
+    "training": "checkpoint devices history learner",
+}
 #: Old name -> new name, below `tdanet_jax`.
-MOVED = {
-    "ai2thor": "agent.ai2thor",
-    "assets": "io.assets",
-    "attention": "analysis.attention",
-    "checkpoint": "training.checkpoint",
-    "classes": "models.classes",
-    "comparison": "evaluation.comparison",
-    "detections": "sensors.detections",
-    "devices": "training.devices",
-    "episode_lookup": "analysis.episode_lookup",
-    "episodes": "evaluation.episodes",
+MOVED = {name: f"{new}.{name}" for new, names in _PACKAGES.items() for name in names.split()} | {
     "evaluation.evaluate_lists": "evaluation.rollout.evaluate_lists",
-    "figures": "analysis.figures",
-    "files": "io.files",
     "graph": "models.class_graph",
-    "history": "training.history",
-    "learner": "training.learner",
     "measure": "tools.benchmarking",
-    "metrics": "evaluation.metrics",
-    "odometry": "sensors.odometry",
-    "paper": "evaluation.paper",
     "parameters": "models.parameter_count",
-    "pictures": "analysis.pictures",
-    "policies": "evaluation.policies",
-    "replay": "analysis.replay",
-    "report": "evaluation.report",
     "returns": "training.gae",
-    "reward": "env.reward",
     "saved": "evaluation.saved_networks",
     "scenes.poses": "poses",
-    "sweep": "evaluation.sweep",
-    "trace": "analysis.trace",
-    "triangulation": "sensors.triangulation",
-    "untrusted": "io.untrusted",
-    "zero_shot": "env.zero_shot",
 }
 
 

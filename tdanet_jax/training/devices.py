@@ -80,8 +80,6 @@ def is_lead() -> bool:
 
 def from_lead(value: float) -> float:
     """The lead process's value, in every process."""
-    if jax.process_count() == 1:
-        return value
     return float(multihost_utils.broadcast_one_to_all(np.float64(value)))
 
 
@@ -106,8 +104,7 @@ def whole(tree: Any, mesh: Mesh) -> Any:
 
 def wait_for_all(reason: str) -> None:
     """Returns when every process has arrived here."""
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices(reason)
+    multihost_utils.sync_global_devices(reason)
 
 
 def split(mesh: Mesh) -> NamedSharding:
