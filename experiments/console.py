@@ -15,16 +15,7 @@ from typing import Any, NoReturn, TypeVar
 
 import tyro
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from rich.text import Text
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from experiments.signals import Stopped, StopRequest
 from tdanet_jax.splits import GROUPS
@@ -122,28 +113,6 @@ def check_positive(**flags: int | Sequence[int]) -> None:
                 fail(f"--{name} {value}: must be positive")
 
 
-class _Figures(ProgressColumn):
-    """The figures next to the bar."""
-
-    def render(self, task: Task) -> Text:
-        return Text(str(task.fields.get("figures", "")))
-
-
-def progress_bar(transient: bool) -> Progress:
-    """A bar with the share done, figures, time spent and time left; a transient one disappears."""
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=24),
-        TextColumn("{task.percentage:>5.1f} %"),
-        _Figures(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=console,
-        transient=transient,
-    )
-
-
 @contextlib.contextmanager
 def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, str], None]]:
     """Shows progress with `report(share, figures)`: a live bar on a terminal, otherwise lines.
@@ -156,7 +125,16 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
       transient: on a terminal, remove the bar at the end.
     """
     if console.is_terminal:
-        with progress_bar(transient) as bar:
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>5.1f} %"),
+            TextColumn("{task.fields[figures]}", markup=False),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=console, transient=transient) as bar:
             task = bar.add_task(title, total=1.0, figures="")
 
             def live(share: float, figures: str) -> None:

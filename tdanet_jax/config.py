@@ -303,15 +303,10 @@ def from_json(values: Mapping[str, Any]) -> TrainConfig:
       ValueError: a field is missing, unknown or out of range.
     """
     try:
-        config = TrainConfig(
-            **{
-                **values,
-                "learner": LearnerConfig(**values["learner"]),
-                "network": NetworkConfig(
-                    **{**values["network"], "sensors": tuple(values["network"].get("sensors", ()))}
-                ),
-            }
-        )
+        network = {"sensors": (), **values["network"]}
+        network["sensors"] = tuple(network["sensors"])
+        parts = {"learner": LearnerConfig(**values["learner"]), "network": NetworkConfig(**network)}
+        config = TrainConfig(**{**values, **parts})
     except (KeyError, TypeError) as error:
         raise ValueError(f"not a configuration of this version: {error}") from None
     config.check()

@@ -41,16 +41,12 @@ class Spread(NamedTuple):
 
 def flags(config: TrainConfig) -> dict[str, Any]:
     """A configuration's values by flag: --num-envs 256."""
-    return dict(_flags(dataclasses.asdict(config)))
-
-
-def _flags(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flags(value)
-        else:
-            shown = " ".join(value) or None if isinstance(value, list | tuple) else value
-            yield f"--{name.replace('_', '-')}", shown
+    values = dataclasses.asdict(config)
+    values |= values.pop("learner") | values.pop("network")
+    return {
+        f"--{name.replace('_', '-')}": " ".join(value) or None if name == "sensors" else value
+        for name, value in values.items()
+    }
 
 
 def settings(config: TrainConfig) -> dict[str, Any]:
