@@ -1,12 +1,12 @@
-"""Evaluates trained agents, or one that needs no training, on the fixed test episodes.
+"""Evaluates trained agents or untrained policies on the fixed test episodes.
 
     python -m experiments.evaluate --checkpoint runs/... --policy greedy
     python -m experiments.evaluate --checkpoint runs/... --history
     python -m experiments.evaluate --checkpoint runs/a --checkpoint runs/b --out compared
     python -m experiments.evaluate --policy random --split 18/4 --out random
 
-One agent: results.json, results.md and episodes.jsonl. Several checkpoints, or a run's history:
-evaluations.json, evaluations.md, episodes.jsonl and, of a history, learning_curve.png.
+Writes results.json, results.md and episodes.jsonl for one agent; for several checkpoints or a
+history, evaluations.json, evaluations.md, episodes.jsonl and, of a history, learning_curve.png.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tdanet_jax.io import files
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Evaluates trained agents, or one that needs no training, on the fixed test episodes."""
+    """Evaluates trained agents or untrained policies on the fixed test episodes."""
 
     checkpoint: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
     """Folder of a run; its newest checkpoint is evaluated. Repeat the flag for more runs: they are
@@ -34,11 +34,10 @@ class Command:
     """Evaluate the whole history of each run instead of its newest checkpoint, and draw the
     learning curve."""
     policy: Literal["sample", "greedy", "random", "shortest_path"] = "sample"
-    """sample and greedy: how the network's actions are chosen. random and shortest_path need no
-    checkpoint; the latter knows the room."""
+    """sample and greedy: how a network's actions are chosen. random and shortest_path (the optimum)
+    need no checkpoint."""
     split: str | None = None
-    """Split for policies that need no checkpoint, as of the training command; by default 18/4. A
-    run is evaluated on its own."""
+    """Split for policies that need no checkpoint; by default 18/4. A run has its own."""
     validation: bool = False
     """Evaluate policies that need no checkpoint on the validation episodes."""
     data: str | None = None

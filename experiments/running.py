@@ -29,19 +29,19 @@ class Command:
 
     run: tyro.conf.OmitArgPrefixes[TrainConfig]
     preset: Literal["default", "best", "paper"] = "default"
-    """Defaults of the other flags. best: what did best on validation, beyond the paper: --odometry,
-    --triangulation, --gamma 0.97 and --size-noise 0.5. paper: the reference's constants and its
-    budget of 6 M episodes."""
+    """Defaults of the other flags. best: --odometry, --triangulation, --gamma 0.97 and
+    --size-noise 0.5, which did best on validation. paper: the reference implementation's
+    hyperparameters and its budget of 6 M episodes."""
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""
     resume: Path | None = None
-    """Folder of a run to continue. Takes only --devices, --tensorboard and a new budget, which
-    replaces the run's (its schedules then follow the new one)."""
+    """Folder of a run to continue. Accepts only --devices, --tensorboard and a new budget, which
+    replaces the run's; its schedules then follow the new one."""
     tensorboard: bool = False
     """Also write TensorBoard events (needs tensorboardX)."""
     devices: int = 1
-    """Devices to split the environments over, in this process; a CPU is split into as many. Further
-    processes, on this machine or others, join through JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES
+    """Devices in this process to split the environments over; a CPU is split into as many. Further
+    processes, on this or other machines, join through JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES
     and JAX_PROCESS_ID."""
 
 

@@ -102,7 +102,7 @@ class Provenance:
 
 
 def columns(tables: SceneTables, episodes: Episodes, records: Records) -> Columns:
-    """Records as named columns of length E, with names in place of indices."""
+    """Records as named columns of length E, with names instead of indices."""
     pose = poses.split(episodes.pose)
     rotation, horizon = pose.degrees
     scene = tables.position_scene[pose.position]

@@ -68,8 +68,8 @@ def evaluate_stacked(
     Args:
       weights: parameters stacked, each leaf [W, ...].
       seed: of all, or one for each [W].
-      batched: whether the networks play in parallel or one after the other. None chooses what is
-        faster: in parallel on an accelerator, one after the other on a CPU.
+      batched: whether the networks play in parallel or one after the other. None chooses the faster
+        way: in parallel on an accelerator, one after the other on a CPU.
 
     Returns:
       What `evaluate_lists` gives for each network. Equal seeds, equal random streams.

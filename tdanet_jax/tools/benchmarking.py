@@ -262,18 +262,17 @@ def decision_row(task: Task, count: int, repeats: int) -> Row:
     """One decision of an untrained model: an observation in, action probabilities out."""
     model = task.model
     weights = jax.jit(model.initialise)(jax.random.key(0), task.words)
-    table = jax.jit(actor_critic.prepare, static_argnums=0)(model, weights, task.words)
+    class_table = jax.jit(actor_critic.prepare, static_argnums=0)(model, weights, task.words)
     keys = jax.random.split(jax.random.key(1), count)
     obs, _ = jax.jit(jax.vmap(dynamics.reset, (0, None)))(keys, task.eval_params)
-    carry, fresh = model.initial_carry(count, weights), jnp.zeros(count, bool)
-    previous = jnp.zeros((count, 6))
+    state = actor_critic.initial_state(model, weights, count)
 
     @jax.jit
-    def decide(weights: Any, table: Any, carry: Any, obs: Any) -> Any:
-        return actor_critic.forward(model, weights, table, carry, obs, previous, fresh)
+    def decide(weights: Any, class_table: Any, state: Any, obs: Any) -> Any:
+        return actor_critic.act(model, weights, class_table, state, obs)
 
     inner = 20 if count == 1 else 1
-    first, seconds = timed(lambda: decide(weights, table, carry, obs), 4 * repeats, inner)
+    first, seconds = timed(lambda: decide(weights, class_table, state, obs), 4 * repeats, inner)
     return {
         "part": "decision",
         "batch": count,

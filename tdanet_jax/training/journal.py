@@ -61,7 +61,7 @@ def read_metrics(folder: Path) -> list[Row]:
 def tensorboard_sink(folder: Path) -> Callable[[Row], None]:
     """A function that writes rows as TensorBoard events into `folder`/tensorboard.
 
-    If events cannot be written, it gives up with a warning, and training goes on.
+    If events cannot be written, it gives up with a warning, and training continues.
     """
     # Not SummaryWriter: a full disk ends its thread, and its queue then blocks for ever.
     from tensorboardX.event_file_writer import EventsWriter

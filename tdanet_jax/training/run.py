@@ -22,7 +22,7 @@ from tdanet_jax.training.learner import TrainState
 
 
 class Run:
-    """A run in its folder: `state` is where it stands, `seconds` its training time so far."""
+    """A run in its folder: `state` is its present state, `seconds` its training time so far."""
 
     def __init__(
         self,
