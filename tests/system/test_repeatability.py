@@ -18,7 +18,7 @@ from tests.system.test_kills import assert_equal_runs, final_state
 BUILDER = """
 import numpy as np
 from tdanet_jax.scenes import tabulation
-from tests import toy
+from tests.support import toy
 draw = np.random.default_rng(0)
 print(tabulation.build([toy.random_room(draw, name=f"Room{i}") for i in range(4)]).data_version)
 """

@@ -17,11 +17,11 @@ from tdanet_jax.training import devices, learner
 #: In a process of its own, which alone can split its CPU into eight devices.
 EIGHT = """
 import dataclasses, jax, numpy as np
-from tdanet_jax import devices
+from tdanet_jax.training import devices
 mesh = devices.connect(8)
 from jax.sharding import Mesh
-from tdanet_jax import learner
-from tests.test_learner import CONFIG, MODEL, PARAMS, WORDS
+from tdanet_jax.training import learner
+from tests.training.test_learner import CONFIG, MODEL, PARAMS, WORDS
 
 config = dataclasses.replace(CONFIG, num_envs=24)
 ends = []
@@ -38,12 +38,13 @@ for over in (Mesh(np.array(jax.devices()[:1]), (devices.AXIS,)), mesh):
     assert ("all-reduce" in chunk.as_text()) == (over.size > 1)
     after, metrics = chunk(state, jax.numpy.zeros(2), words, params)
     assert {len(x.sharding.device_set) for x in jax.tree.leaves(after)} == {over.size}
-    assert after.previous.addressable_shards[0].data.shape == (24 // over.size, 6)
+    assert after.recurrent.prev_action_probs.addressable_shards[0].data.shape == (24 // over.size, 6)
     ends.append(jax.device_get((after.replace(key=0), metrics)))
 (one, one_metrics), (many, many_metrics) = ends
-for name in ("env_state", "held", "fresh", "updates", "episodes"):  # what the actions led to
+for name in ("env_state", "bootstrap_only", "updates", "episodes"):  # what the actions led to
     same = jax.tree.map(np.array_equal, getattr(one, name), getattr(many, name))
     assert all(jax.tree.leaves(same)), name
+np.testing.assert_array_equal(one.recurrent.is_first, many.recurrent.is_first)
 close = lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-6)
 jax.tree.map(close, one.params, many.params)
 jax.tree.map(close, one_metrics, many_metrics)

@@ -84,13 +84,13 @@ def test_a_stopped_run_goes_on_bit_for_bit(which, tmp_path, request):
     for count, _ in enumerate(stopped.chunks(), start=1):
         if count == 3:
             stopped.save()
-        if count == 5:  # two chunks behind the checkpoint are lost
+        if count == 5:  # two chunks after the checkpoint are lost
             break
     again = Run(tmp_path, config, task)
     assert again.steps == 240
-    trail = again.state.env_state.trail
-    assert (trail is not None) == (which == "sensing_whole")
-    assert trail is None or trail.sighting.normal.any()
+    sensors = again.state.env_state.sensors
+    assert bool(sensors) == (which == "sensing_whole")
+    assert not sensors or sensors["triangulation"].normal.any()
     list(again.chunks())
     for ours, theirs in zip(leaves(again.state), leaves(whole[1].state), strict=True):
         np.testing.assert_array_equal(ours, theirs)
