@@ -294,10 +294,6 @@ def curve(label: str, runs: Sequence[Sequence[Result]]) -> Curve:
     """The curve of one or several seeds, from the results of their histories.
 
     It has the points of the budget that all seeds have.
-
-    Args:
-      label: its name.
-      runs: the results of each seed's history.
     """
     by_share = [{result["share"]: result for result in run} for run in runs]
     common = sorted(set.intersection(*(set(points) for points in by_share)))

@@ -108,10 +108,6 @@ def share(run: Path, out: Path) -> None:
     It holds the configuration, the classes, the network with 16 bits per parameter, and the run's
     results and records if there are any; training cannot continue from it.
 
-    Args:
-      run: the run's folder.
-      out: the folder to write.
-
     Raises:
       ValueError: the folder holds no run, or its network cannot be read or does not fit.
     """

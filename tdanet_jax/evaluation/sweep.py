@@ -29,12 +29,6 @@ def plan(
 ) -> list[TrainConfig]:
     """The configurations of a sweep; the seeds of one split and model follow one another.
 
-    Args:
-      base: all other settings.
-      splits: names of splits.
-      models: names of models.
-      seeds: training seeds.
-
     Raises:
       ValueError: a value is not allowed or given twice; the message names the flag.
     """
