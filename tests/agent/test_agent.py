@@ -364,8 +364,8 @@ def test_a_run_of_the_first_version_still_decides_as_it_did(tmp_path):
 def test_a_checkpoint_of_a_newer_version_is_refused_in_one_line(tmp_path):
     run = shutil.copytree(OLD_RUN, tmp_path / "run")
     meta = run / "checkpoints" / "2" / "meta" / "metadata"
-    meta.write_text(meta.read_text().replace('"format": 1', '"format": 2'))
-    with pytest.raises(ValueError, match="checkpoint of format 2, this version reads up to 1"):
+    meta.write_text(meta.read_text().replace('"format": 1', '"format": 3'))
+    with pytest.raises(ValueError, match="checkpoint of format 3, this version reads up to 2"):
         tdanet_jax.load(run)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import tdanet_jax
-from experiments import train_zero_shot
+from experiments.running import how_to_continue
 from tdanet_jax.agent.agent import Detection
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.models.classes import ClassVocabulary
@@ -45,12 +45,12 @@ def test_the_example_on_the_page_is_a_model(
     assert other.value != decision.value
 
 
-def test_who_stops_a_run_of_a_model_of_ones_own_learns_how_to_trust_it(tmp_path):
+def test_who_stops_a_run_of_a_custom_model_learns_how_to_trust_it(tmp_path):
     (tmp_path / "config.json").touch()
     again = f"python -m experiments.train_zero_shot --resume {tmp_path}"
-    said = train_zero_shot.how_to_go_on(tmp_path, "my_lab.most_alike")
-    assert said.endswith(f"go on with: TDANET_TRUST=my_lab.most_alike {again}")
-    assert train_zero_shot.how_to_go_on(tmp_path, "savn").endswith(f"go on with: {again}")
+    said = how_to_continue(tmp_path, TrainConfig(model="my_lab.most_alike"))
+    assert said.endswith(f"continue with: TDANET_TRUST=my_lab.most_alike {again}")
+    assert how_to_continue(tmp_path, TrainConfig(model="savn")).endswith(f"continue with: {again}")
 
 
 def test_a_module_that_makes_no_model_is_refused(tmp_path, monkeypatch):
