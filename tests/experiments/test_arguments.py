@@ -50,7 +50,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--out full/file/below", "full/file/below: Not a directory"),
         ("--resume nowhere", "nowhere/config.json: no such file; is this the folder of a run?"),
         ("--devices 0", "--devices 0: must be positive"),
-        ("--resume nowhere --seed 5", "--resume continues a run as it began: it takes a new budget"),
+        ("--resume nowhere --seed 5", "--resume continues a run as it began: it takes a new"),
         ("--resume full/file", "full/file/config.json: Not a directory"),
         ("--resume broken", "broken/config.json: Expecting property name"),
         ("--resume binary", "binary/config.json: 'utf-8' codec can't decode"),

@@ -76,7 +76,8 @@ def test_a_model_that_cannot_triangulate_is_one_line(ithor, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         benchmark.main(["--parts", "decision", *flags, "--out", str(tmp_path / "figures.jsonl")])
     assert ended.value.code == 2
-    assert "needs a box of every object, which ssnet does not show" in capsys.readouterr().err.splitlines()[-1]
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "needs a box of every object, which ssnet does not show" in said
 
 
 @pytest.mark.parametrize("senses", [(False, False), (True, False), (True, True)])
