@@ -209,17 +209,6 @@ def _cell(value: object) -> str:
     return f"{value:.1f}" if isinstance(value, float) else str(value)
 
 
-def paper_rows(split: str) -> dict[str, dict[str, Any]]:
-    """The paper's agents on a split: name -> group -> bucket -> measure."""
-    out: dict[str, dict[str, Any]] = {}
-    for group in GROUPS:
-        for agent, rates in paper.rates(split, group):
-            out.setdefault(agent, {})[group] = {
-                bucket: {"SR": rate.sr, "SPL": rate.spl} for bucket, rate in rates.items()
-            }
-    return out
-
-
 def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
     """A page on several networks: a row for each, means over seeds, the paper's rows.
 
@@ -238,13 +227,13 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
         ]
         rows += (differing := list(_differences(own, names)))
         rows += _means(own, names)
-        for agent, groups in paper_rows(split).items():
+        for agent, groups in paper.rates(split).items():
             rows.append(((f"{agent} (paper)", "", "", ""), groups))
         lines += ["", f"## Split {split}", ""]
         lines += table(("Agent", "Updates", "Training episodes", "Actions"), rows)
         if differing:
             lines += ["", "Differences: in the same episodes, 95 % intervals (paired bootstrap)."]
-        if paper_rows(split):
+        if paper.rates(split):
             worlds = dict.fromkeys(paper.worlds(result["data"]) for result in own)
             lines += ["", *worlds]
     return "\n".join(lines) + "\n"

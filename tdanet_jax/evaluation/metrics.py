@@ -87,9 +87,11 @@ def _averages(
 
 
 def shown(bucket: Mapping[str, Any], measure: str) -> str:
-    """A mean and its interval, as in every table: 75.1 (70.2 to 80.0)."""
-    if bucket[measure] is None:
+    """A mean and its interval, if there is one, as in every table: 75.1 (70.2 to 80.0)."""
+    if bucket.get(measure) is None:
         return "-"
+    if f"{measure}_ci" not in bucket:
+        return f"{bucket[measure]:.1f}"
     low, high = bucket[f"{measure}_ci"]
     return f"{bucket[measure]:z.1f} ({low:z.1f} to {high:z.1f})"
 

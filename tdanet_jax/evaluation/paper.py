@@ -5,7 +5,6 @@ Only some rows of its tables. Where they are shown, a note says that the worlds 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 WORLDS_DIFFER = (
@@ -49,8 +48,11 @@ NAMES = {
 }
 
 
-def rates(split: str, group: str) -> Iterator[tuple[str, dict[str, Rate]]]:
-    """The agents of a table: name, and its rates by bucket."""
-    found = [rate for rate in RATES if (rate.split, rate.group) == (split, group)]
-    for agent in dict.fromkeys(rate.agent for rate in found):
-        yield agent, {rate.bucket: rate for rate in found if rate.agent == agent}
+def rates(split: str) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
+    """The paper's agents on a split: name -> group -> bucket -> measure."""
+    out: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    for rate in RATES:
+        if rate.split == split:
+            groups = out.setdefault(rate.agent, {})
+            groups.setdefault(rate.group, {})[rate.bucket] = {"SR": rate.sr, "SPL": rate.spl}
+    return out

@@ -223,6 +223,7 @@ def all_rows(tables: SceneTables, played: Played) -> Iterator[dict[str, Any]]:
 def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
     """`results.md`: tables as in the paper, with the paper's rows next to ours."""
     agent = ObservationSpec(sensors=tuple(out["sensors"])).agent_name(out["model"])
+    published = paper.rates(out["split"])
     lines = [
         f"# {agent}, split {out['split']}, seed {out['seed']}",
         "",
@@ -239,8 +240,10 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
         if out[group] is None:
             continue
         lines.append(_row((group, f"**{agent} (ours)**"), out[group]))
-        lines += [_paper_row(group, *row) for row in paper.rates(out["split"], group)]
-    if any(rate.split == out["split"] for rate in paper.RATES):
+        for name, theirs in published.items():
+            if group in theirs:
+                lines.append(_row((group, f"{name} (paper)"), theirs[group]))
+    if published:
         lines += ["", paper.worlds(out["data"])]
     if "unseen" in groups and (apart := _near_synonyms(groups["unseen"])):
         known = "; ".join(
@@ -280,15 +283,6 @@ def _header(*first: str) -> list[str]:
 
 def _row(first: tuple[str, ...], buckets: Mapping[str, Mapping[str, Any]]) -> str:
     cells = [*first]
-    for bucket in BUCKETS:
-        part = buckets[bucket]
-        cells += [shown(part, "SR"), shown(part, "SPL"), str(part["n"])]
-    return f"| {' | '.join(cells)} |"
-
-
-def _paper_row(group: str, agent: str, rates: Mapping[str, paper.Rate]) -> str:
-    cells = [group, f"{agent} (paper)"]
-    for bucket in BUCKETS:
-        rate = rates.get(bucket)
-        cells += ["-", "-", ""] if rate is None else [f"{rate.sr:.1f}", f"{rate.spl:.1f}", ""]
+    for part in (buckets.get(bucket, {}) for bucket in BUCKETS):
+        cells += [shown(part, "SR"), shown(part, "SPL"), str(part.get("n", ""))]
     return f"| {' | '.join(cells)} |"

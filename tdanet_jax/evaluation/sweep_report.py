@@ -178,7 +178,7 @@ def _comparison(report: Report, split: str) -> Iterator[str]:
         ((f"{label} (ours)", str(len(out["seeds"])), _count(out["episodes_trained"])), out)
         for label, out in summaries.items()
     ]
-    theirs = comparison.paper_rows(split)
+    theirs = paper.rates(split)
     rows += [((f"{agent} (paper)", "", ""), groups) for agent, groups in theirs.items()]
     tables = " (the paper's Tables I to III)" if split in PAPER_SPLITS else ""
     yield from ("", f"## Split {split}: comparison of models{tables}", "")

@@ -25,11 +25,7 @@ class Run:
     """A run in its folder: `state` is its present state, `seconds` its training time so far."""
 
     def __init__(
-        self,
-        folder: Path,
-        config: TrainConfig,
-        task: Task,
-        mesh: Mesh | None = None,
+        self, folder: Path, config: TrainConfig, task: Task, mesh: Mesh | None = None
     ) -> None:
         """The run in `folder`, new or from its newest checkpoint.
 
@@ -52,6 +48,7 @@ class Run:
         shapes = jax.eval_shape(self._init, jax.random.key(0), self._words, self._params)
         self._layout = devices.layout(shapes, self._mesh)
         self.checkpoints = Checkpoints(folder)
+        self._journal: Journal | None = None
         self._saved: int | None = None  # updates of the checkpoint with the present state
         fresh = self.checkpoints.latest() is None
         self.state: TrainState = self._begin() if fresh else self._restore()
@@ -67,9 +64,8 @@ class Run:
         return learner.init(key, self.config.learner, self.model, words, params)
 
     def _begin(self) -> TrainState:
-        key = jax.random.key(self.config.seed)
         init = jax.jit(self._init, out_shardings=self._layout)
-        return init(key, self._words, self._params)
+        return init(jax.random.key(self.config.seed), self._words, self._params)
 
     def _restore(self) -> TrainState:
         def make_state() -> TrainState:
@@ -120,7 +116,7 @@ class Run:
         Raises:
           ValueError: too many updates were skipped; the state is saved first.
         """
-        journal = self._journal()
+        self._open_journal()
         if self._over(until):
             return
         chunk = self._compile()
@@ -129,19 +125,18 @@ class Run:
             state, metrics = chunk(self.state, shares, self._words, self._params)
             metrics = jax.device_get(metrics)
             took = devices.from_lead(time.perf_counter() - began)
-            yield self._record(state, metrics, before, took, journal)
+            yield self._record(state, metrics, before, took)
             self._check_finite()
 
     def _over(self, until: int | None) -> bool:
         stopped = until is not None and int(self.state.updates) >= until
         return stopped or self.progress >= 1.0
 
-    def _journal(self) -> Journal | None:
-        """The journal, in the lead alone; drops what was written after the checkpoint."""
-        if not devices.is_lead():
-            return None
-        history.drop_after(self.folder, int(self.state.updates))
-        return Journal(self.folder / METRICS_FILE, int(self.state.updates))
+    def _open_journal(self) -> None:
+        """Opens the journal, in the lead alone; drops what was written after the checkpoint."""
+        if devices.is_lead():
+            history.drop_after(self.folder, int(self.state.updates))
+            self._journal = Journal(self.folder / METRICS_FILE, int(self.state.updates))
 
     def _shares(self) -> jax.Array:
         """Fractions of the budget that are used before and after the next chunk.
@@ -155,19 +150,14 @@ class Run:
         return jnp.array([before, min(1.0, before + pace)], jnp.float32)
 
     def _record(
-        self,
-        state: TrainState,
-        metrics: dict[str, np.ndarray],
-        before: float,
-        took: float,
-        journal: Journal | None,
+        self, state: TrainState, metrics: dict[str, np.ndarray], before: float, took: float
     ) -> Row:
         """Takes the state after a chunk; writes its row and, if one is due, a point."""
         self.state = state
         self.seconds += took
         row = self._row(metrics, took)
-        if journal is not None:
-            journal.write(row)
+        if self._journal is not None:
+            self._journal.write(row)
             self._keep_point(before)
         return row
 
@@ -206,8 +196,7 @@ class Run:
     def _compile(self) -> jax.stages.Compiled:
         config, places = self.config, (self._layout, self._shared)
         chunk = learner.make_train(config.learner, self.model, config.chunk_updates, places)
-        share = jnp.zeros(2, jnp.float32)
-        return chunk.lower(self.state, share, self._words, self._params).compile()
+        return chunk.lower(self.state, self._shares(), self._words, self._params).compile()
 
     def _row(self, metrics: dict[str, np.ndarray], took: float) -> Row:
         """One line of `metrics.jsonl`: means over the chunk's episodes, updates and steps.
@@ -268,7 +257,8 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
 
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(run.state for run in runs))
     arguments = runs[0]._words, runs[0]._params
-    journals = [run._journal() for run in runs]
+    for run in runs:
+        run._open_journal()
     chunk = several.lower(stacked, runs[0]._shares(), *arguments).compile()
     while runs[0].progress < 1.0:
         before, shares, began = runs[0].progress, runs[0]._shares(), time.perf_counter()
@@ -278,7 +268,7 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
         rows = []
         for i, (run, state) in enumerate(zip(runs, apart(stacked), strict=True)):
             own = {name: values[i] for name, values in metrics.items()}
-            rows.append(run._record(state, own, before, took, journals[i]))
+            rows.append(run._record(state, own, before, took))
         yield rows
         for run in runs:
             run._check_finite()
