@@ -20,8 +20,8 @@ from tdanet_jax.env.types import EnvParams
 from tdanet_jax.io import files
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary
-from tdanet_jax.scenes import SceneTables
 from tdanet_jax.models.factory import make_model
+from tdanet_jax.scenes import SceneTables
 from tdanet_jax.training import checkpoint
 from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.training.learner import TrainState, init
