@@ -38,7 +38,8 @@ for over in (Mesh(np.array(jax.devices()[:1]), (devices.AXIS,)), mesh):
     assert ("all-reduce" in chunk.as_text()) == (over.size > 1)
     after, metrics = chunk(state, jax.numpy.zeros(2), words, params)
     assert {len(x.sharding.device_set) for x in jax.tree.leaves(after)} == {over.size}
-    assert after.recurrent.prev_action_probs.addressable_shards[0].data.shape == (24 // over.size, 6)
+    probs = after.recurrent.prev_action_probs
+    assert probs.addressable_shards[0].data.shape == (24 // over.size, 6)
     ends.append(jax.device_get((after.replace(key=0), metrics)))
 (one, one_metrics), (many, many_metrics) = ends
 for name in ("env_state", "bootstrap_only", "updates", "episodes"):  # what the actions led to
