@@ -1,8 +1,8 @@
-"""What a network attends to: Eq. 1 and 2 in any state, and means over pairs of classes.
+"""What a network attends to: attention in any state, and its means over pairs of classes.
 
-Correspondence is the inner product of a detection's row and the target's, both through W_L;
-attention is its softmax over the detections in view (Eq. 1). The difference is the absolute
-difference of the attended detection and the target in the Siamese comparison (Eq. 2).
+Correspondence is the inner product of a detection's row and the target's, both through W_L (Eq. 1);
+attention is its softmax over the detections in view (Eq. 2). The difference is the absolute
+difference of the attended detection and the target in the Siamese comparison.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ BATCH = 1024
 
 
 class FrameAttention(NamedTuple):
-    """The values of Eq. 1 and 2 in a batch of frames [B]; None where the model has none."""
+    """Attention and difference in a batch of frames [B]; None where the model has none."""
 
     attention: jax.Array | None  # [B, K], weight of each detection, 0 in padding
     correspondence: jax.Array | None  # [B, K], attention before the softmax; undefined in padding
@@ -38,7 +38,7 @@ class FrameAttention(NamedTuple):
 def act(
     model: ActorCritic, weights: Any, class_table: Any, state: RecurrentState, obs: Observation
 ) -> tuple[RecurrentState, Output, FrameAttention]:
-    """`actor_critic.act`, with the values of Eq. 1 and 2 on its way."""
+    """`actor_critic.act`, with the attention on its way."""
     state, out, kept = actor_critic.act(
         model, weights, class_table, state, obs, collections=("intermediates",)
     )
@@ -56,7 +56,7 @@ def attend(
     target: jax.Array,
     params: EnvParams,
 ) -> tuple[Observation, FrameAttention]:
-    """Eq. 1 and 2 in any states.
+    """Attention and difference in any states.
 
     Args:
       words: [C, D] word vectors of the tables' classes.

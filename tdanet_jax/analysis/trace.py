@@ -100,8 +100,8 @@ class Trace:
       value: [T], expected discounted return.
       attention: T arrays [n], weight of each of the n objects in view, in the tables' order. For
         a network with a row per class, every object of the class has the row's weight.
-      correspondence: the same, before the softmax of Eq. 1.
-      difference: [T], mean over the units of Eq. 2's absolute difference.
+      correspondence: the same, before the softmax (Eq. 1).
+      difference: [T], mean over the units of the Siamese comparison's absolute difference.
     """
 
     player: str

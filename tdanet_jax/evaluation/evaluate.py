@@ -71,7 +71,8 @@ def evaluate(
     results, records, columns = {}, [], {}
     for done in evaluated:
         results[done.saved] = done.results()
-        columns[done.saved] = done.columns()
+        if not history:
+            columns[done.saved] = done.columns()
         where = {"run": str(done.saved.run), "updates": done.snapshot.updates}
         records += [{**where, **row} for row in report.all_rows(done.task.tables, done.played)]
         if on_network is not None:

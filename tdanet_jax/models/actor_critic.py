@@ -192,7 +192,7 @@ def act(
 
     Args:
       collections: Flax collections to return: `ACTIVATIONS` while training, "intermediates" for the
-        attention and the values of Eq. 1 and 2.
+        attention, its logits and the Siamese difference.
 
     Returns:
       The state after the step, policy and value, and the collections by name.

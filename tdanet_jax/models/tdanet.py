@@ -1,9 +1,9 @@
 """TDANet's encoder (Lian and Zhang 2024): target attention and a Siamese comparison.
 
-Target attention (TA, Eq. 1): the target and every detection go through one linear map W_L; the
-logits are inner products, the weights their masked softmax, and V_L1 = V_att M_L1. Siamese
-architecture (SA, Eq. 2): the same layers on the attended detection and on the target, and the
-absolute difference of the two.
+Target attention (TA): the target and every detection go through one linear map W_L; the logits are
+inner products (Eq. 1), the weights their masked softmax (Eq. 2), and V_L1 = V_att M_L1. Siamese
+architecture (SA): the same layers on the attended detection and on the target, and the absolute
+difference of the two.
 
 Three equal but cheaper forms are used; a test compares them with the printed ones. All class names
 are known in training, so the products of word vectors are computed once per update for all classes
@@ -92,7 +92,7 @@ class TDANetEncoder(Encoder):
         return nn.relu(self.linear2(nn.relu(self.linear1(rows))))
 
     def attend(self, class_table: ClassTable, obs: Observation) -> jax.Array:
-        """Attention over the detections (Eq. 1): [..., K], 0 in padding, summing to 1.
+        """Attention over the detections (Eq. 2): [..., K], 0 in padding, summing to 1.
 
         In a frame without detections the first row, all zero, has weight 1.
         """
