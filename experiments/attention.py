@@ -55,27 +55,25 @@ def show(command: Command) -> None:
     from tdanet_jax.training import devices
 
     devices.keep_compiled()
-    choice, out = command.choice, command.out or default_folder(command)
-    runs = [command.checkpoint]
+    choice, runs = command.choice, [command.checkpoint]
+    out = command.out or default_folder(command)
     rooms = one_episode.load_rooms(choice, runs)
     tables = rooms.tables
-    chosen = one_episode.choose(choice, runs, tables) if choice.given else None
     player = one_episode.load_players(runs, rooms, choice.policy)[0]
     if not player.attends:
         fail(
             f"--checkpoint {command.checkpoint}: this model has no attention over the detections; "
             "the TDANet models have"
         )
-    if chosen is None:
+    if choice.given:
+        trace = one_episode.play(choice, runs, [player], tables)[0]
+    else:
         played = play_lists(player, tables, choice.seed)
         write_pairs(player, tables, played, out)
         trace = example(player, tables, played)
-    else:
-        trace = one_episode.play(chosen, [player], tables, choice.seed)[0]
     out.mkdir(parents=True, exist_ok=True)
     picture = out / f"{trace.scene}-{trace.target}.png"
-    title = f"{player.name}: {trace.target} in {trace.scene}"
-    pictures.attention_episode(trace, tables, title, picture)
+    pictures.attention_episode(trace, tables, picture)
     console.print(f"{trace.target} in {trace.scene}: {trace.outcome}")
     console.print(f"wrote {picture}")
 
@@ -83,8 +81,8 @@ def show(command: Command) -> None:
 def default_folder(command: Command) -> Path:
     """The default of --out: one folder for each network and policy."""
     point = f"-{command.checkpoint.stem}" if command.checkpoint.suffix == ".npz" else ""
-    name = f"attention-{command.choice.policy}{point}"
-    return one_episode.folder_of(command.checkpoint) / name
+    folder = one_episode.folder_of(command.checkpoint)
+    return folder / f"attention-{command.choice.policy}{point}"
 
 
 def play_lists(player: Player, tables: SceneTables, seed: int) -> Played:
@@ -109,15 +107,9 @@ def write_pairs(player: Player, tables: SceneTables, played: Played, out: Path) 
     visits = [trace.visited(*pair, task.eval_params) for pair in played.values()]
     pose, target = (np.concatenate(part) for part in zip(*visits, strict=True))
     pairs = attention.class_pairs(
-        player.model,
-        player.weights,
-        task.words,
-        pose,
-        target,
-        task.eval_params,
-        tables.targets,
-        tables.classes,
-    )
+        player.model, player.weights, task.words, pose, target, task.eval_params,
+        tables.targets, tables.classes,
+    )  # fmt: skip
     unseen = {name for names in task.split.unseen.values() for name in names}
     out.mkdir(parents=True, exist_ok=True)
     title = f"Attention of {player.name}, test episodes of split {task.split.name}"

@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import tyro
+
 from experiments.console import console, fail, reporter
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from tdanet_jax.analysis.trace import Player, Trace
-    from tdanet_jax.evaluation.episodes import Episodes
     from tdanet_jax.scenes import SceneTables
     from tdanet_jax.scenes.dataset import Rooms
 
@@ -46,6 +45,17 @@ class Choice:
     def given(self) -> bool:
         """Whether any flag chooses an episode."""
         return any(flag is not None for flag in (self.scene, self.target, self.start, self.episode))
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Flags of the commands that show several agents in the same episode."""
+
+    checkpoint: tyro.conf.UseAppendAction[tuple[Path, ...]]
+    """Folder of a run; repeat the flag to compare several."""
+    choice: tyro.conf.OmitArgPrefixes[Choice]
+    shortest: bool = False
+    """Also shows the shortest path."""
 
 
 def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
@@ -81,9 +91,7 @@ def load_rooms(choice: Choice, runs: Sequence[Path]) -> Rooms:
     """The rooms of --data or of the first run; shows progress if they are rebuilt."""
     from tdanet_jax.scenes import dataset
 
-    data = choice.data
-    if data is None:
-        data = configs.load(folder_of(runs[0]) / CONFIG_FILE).data
+    data = choice.data or configs.load(folder_of(runs[0]) / CONFIG_FILE).data
     with reporter("rooms", transient=True) as report:
         return dataset.load_rooms(data, lambda done, total: report(done / total, "rebuilt"))
 
@@ -100,47 +108,42 @@ def load_players(runs: Sequence[Path], rooms: Rooms, policy: str) -> list[Player
     ]
 
 
-Chosen = tuple["Episodes", "np.ndarray | None"]
+def play(
+    choice: Choice, runs: Sequence[Path], players: Sequence[Player], tables: SceneTables
+) -> list[Trace]:
+    """Each player's trace of the chosen episode; players[0] is the agent of runs[0]."""
+    from tdanet_jax.analysis import episode_lookup, trace
 
-
-def choose(choice: Choice, runs: Sequence[Path], tables: SceneTables) -> Chosen:
-    """The episode that the flags choose, and the actions of runs[0] if it was recorded."""
-    from tdanet_jax.analysis import episode_lookup
-
+    first: list[Trace] = []
     if choice.episode is not None:
-        return episode_lookup.read_record(folder_of(runs[0]), choice.episode, tables)
-    assert choice.scene is not None
-    assert choice.target is not None
-    start = None if choice.start is None else episode_lookup.Start(*choice.start)
-    return episode_lookup.find(tables, choice.scene, choice.target, start, choice.seed), None
+        record = episode_lookup.read_record(folder_of(runs[0]), choice.episode, tables)
+        episode, first = record.episode, [trace.retrace(players[0], tables, *record)]
+    else:
+        assert choice.scene is not None
+        assert choice.target is not None
+        start = None if choice.start is None else episode_lookup.Start(*choice.start)
+        episode = episode_lookup.find(tables, choice.scene, choice.target, start, choice.seed)
+    others = (trace.play(player, tables, episode, choice.seed) for player in players[len(first) :])
+    return [*first, *others]
 
 
-def play(chosen: Chosen, players: Sequence[Player], tables: SceneTables, seed: int) -> list[Trace]:
-    """Each player's trace of the episode; players[0] is the agent of runs[0]."""
+def play_runs(command: Comparison) -> tuple[list[Trace], SceneTables]:
+    """Traces of the chosen episode by the agents of the runs, and the rooms in which it is."""
     from tdanet_jax.analysis import trace
+    from tdanet_jax.training import devices
 
-    episode, actions = chosen
-    if actions is None:
-        return [trace.play(player, tables, episode, seed) for player in players]
-    recorded = trace.retrace(players[0], tables, episode, actions)
-    return [recorded, *(trace.play(player, tables, episode, seed) for player in players[1:])]
-
-
-def play_runs(choice: Choice, runs: Sequence[Path], rooms: Rooms, shortest: bool) -> list[Trace]:
-    """The chosen episode, played by the agents of some runs; `shortest` adds the shortest path."""
-    from tdanet_jax.analysis import trace
-
-    chosen = choose(choice, runs, rooms.tables)
+    devices.keep_compiled()
+    choice, runs = command.choice, command.checkpoint
+    rooms = load_rooms(choice, runs)
     players = load_players(runs, rooms, choice.policy)
-    if shortest:
+    if command.shortest:
         players.append(trace.Player("shortest path", players[0].task))
-    return play(chosen, players, rooms.tables, choice.seed)
+    return play(choice, runs, players, rooms.tables), rooms.tables
 
 
 def print_outcomes(traces: Sequence[Trace], out: Path) -> None:
     """Prints the outcome of each trace, and the file that was written."""
-    first = traces[0]
-    console.print(f"{first.target} in {first.scene}")
+    console.print(f"{traces[0].target} in {traces[0].scene}")
     for trace in traces:
         console.print(f"  {trace.player}: {trace.outcome}")
     console.print(f"wrote {out}")

@@ -103,11 +103,6 @@ class Split:
         )
 
 
-def scene_name(number: int) -> str:
-    """AI2-THOR's name of a scene: FloorPlan228."""
-    return f"FloorPlan{number}"
-
-
 def make_split(text: str, validation: bool = False) -> Split:
     """The split with a name, or the custom one that leaves these classes out (see `split_name`).
 
@@ -123,7 +118,7 @@ def make_split(text: str, validation: bool = False) -> Split:
     last = TRAIN_SCENES_PER_TYPE if validation else None
     train, evaluated = [], []
     for room in ROOM_TYPES:
-        names = [scene_name(n) for n in SCENE_NUMBERS[room]]
+        names = [f"FloorPlan{n}" for n in SCENE_NUMBERS[room]]
         train += names[:first]
         evaluated += names[first:last]
     unseen = {r: _held_out(r, missing[r]) for r in ROOM_TYPES} if validation else missing

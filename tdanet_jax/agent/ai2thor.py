@@ -155,7 +155,10 @@ def play(
     event = controller.last_event
     places, decisions, unnamed = [_place(event)], [], set[str]()
     state = agent.start(places[0].rotation, places[0].horizon)
-    expected, blocked = _on_the_grid(places[0]), False
+    # With its angles rounded, as Unity's are never exact.
+    rotation = 45 * (round(places[0].rotation / 45) % ROTATIONS)
+    horizon = 30 * round(places[0].horizon / 30)
+    expected, blocked = places[0]._replace(rotation=rotation, horizon=horizon), False
     for step in range(step_limit):
         seen = detections(event)
         named = [found for found in seen if agent.knows(found.label)]
@@ -175,12 +178,6 @@ def _place(event: Event) -> Place:
     agent = event.metadata["agent"]
     position = agent["position"]
     return Place(position["x"], position["z"], agent["rotation"]["y"], agent["cameraHorizon"])
-
-
-def _on_the_grid(place: Place) -> Place:
-    """The place, its angles rounded to multiples of 45 and 30 degrees."""
-    rotation = 45 * (round(place.rotation / 45) % ROTATIONS)
-    return place._replace(rotation=rotation, horizon=30 * round(place.horizon / 30))
 
 
 def _take(
@@ -207,15 +204,11 @@ def _take(
     moved = ahead and bool(event.metadata["lastActionSuccess"])
     x, z = (before.x + dx, before.z + dz) if moved else (before.x, before.z)
     expected, after = Place(x, z, 45 * turned, 30 * looking), _place(event)
-    if not _alike(expected, after):
+    turn = (expected.rotation - after.rotation + 180) % 360 - 180
+    away = math.hypot(expected.x - after.x, expected.z - after.z)
+    if not (away < NEAR and max(abs(turn), abs(expected.horizon - after.horizon)) < ALIGNED):
         raise ValueError(
             f"{ACTION_NAMES[action]} from {before} led to {after} and not to {expected}; is the "
             f"controller made with SETTINGS? {event.metadata['errorMessage']}".rstrip()
         )
     return event, expected, ahead and not moved
-
-
-def _alike(one: Place, other: Place) -> bool:
-    turn = (one.rotation - other.rotation + 180) % 360 - 180
-    near = math.hypot(one.x - other.x, one.z - other.z) < NEAR
-    return near and max(abs(turn), abs(one.horizon - other.horizon)) < ALIGNED

@@ -50,13 +50,9 @@ def save(figure: Figure, path: Path, dpi: int = DPI) -> None:
 
 
 def draw_view(
-    axes: Axes,
-    seen: CameraView,
-    attention: np.ndarray | None,
-    target: str | None,
-    colors: Sequence[str] | None = None,
-    scale: float = 1.0,
-) -> None:
+    axes: Axes, seen: CameraView, attention: np.ndarray | None, target: str | None,
+    colors: Sequence[str] | None = None, scale: float = 1.0,
+) -> None:  # fmt: skip
     """The camera's view: boxes shaded by attention, the target outlined.
 
     The outline is dashed while the target is not visible within 1.5 m.
@@ -68,49 +64,42 @@ def draw_view(
     """
     axes.set(xlim=(0, 1), ylim=(1, 0), xticks=[], yticks=[], aspect="equal")
     axes.spines[:].set_color(FRAME)
-    size = (seen.boxes[:, 2] - seen.boxes[:, 0]) * (seen.boxes[:, 3] - seen.boxes[:, 1])
-    for i in sorted(range(len(size)), key=lambda i: (seen.classes[i] == target, -size[i])):
+    sought, areas = np.array(seen.classes) == target, seen.areas
+    for i in sorted(range(len(areas)), key=lambda i: (sought[i], -areas[i])):
         x1, y1, x2, y2 = seen.boxes[i]
-        sought = seen.classes[i] == target
         alpha = 0.0 if attention is None else min(float(attention[i]), 1.0)
-        color, width = ("black", 2.6) if sought else (colors[i] if colors else FRAME, 0.9)
-        dash = DASHED if sought and not seen.visible[i] else "-"
+        color, width = ("black", 2.6) if sought[i] else (colors[i] if colors else FRAME, 0.9)
+        dash = DASHED if sought[i] and not seen.visible[i] else "-"
         box = ((x1, y1), x2 - x1, y2 - y1)
         axes.add_patch(Rectangle(*box, color=BLUE, alpha=alpha, lw=0))
         axes.add_patch(Rectangle(*box, fill=False, edgecolor=color, lw=width, ls=dash))
     size = axes.get_window_extent().width / axes.figure.dpi * 72 * scale * labels.VIEW_FONT
     for label in labels.of_view(seen, attention, target, scale):
-        bold = seen.classes[label.of] == target
-        _write(
-            axes, label.text, label.x, label.y, size, bold, colors[label.of] if colors else "black"
-        )
+        color = colors[label.of] if colors else "black"
+        _write(axes, label.text, label.x, label.y, size, sought[label.of], color)
 
 
 def draw_plan(
-    axes: Axes,
-    plan: FloorPlan,
-    target: str | None,
-    colors: Mapping[int, str] | None = None,
-    scale: float = 1.0,
-) -> None:
+    axes: Axes, plan: FloorPlan, target: str | None,
+    colors: Mapping[int, str] | None = None, scale: float = 1.0,
+) -> None:  # fmt: skip
     """A room from above: furniture, reachable points, the target's objects outlined.
 
     Args:
       colors: of some of the outlines, by index; those have names, too.
       scale: of the names' font.
     """
-    colors = colors or {}
+    colors, sought = colors or {}, plan.of_class(target)
     x1, z1, x2, z2 = plan.extent
     axes.set(xlim=(x1, x2), ylim=(z1, z2), xticks=[], yticks=[], aspect="equal")
     axes.spines[:].set_color(FRAME)
     for i, outline in enumerate(plan.outlines):
         face, edge = ((colors[i], 0.13), colors[i]) if i in colors else ((FILL, 0.7), ("0.7", 0.7))
         axes.add_patch(Polygon(outline, facecolor=face, edgecolor=edge, lw=0.8))
-        if plan.classes[i] == target:
+        if i in sought:
             axes.add_patch(Polygon(outline, fill=False, edgecolor="black", lw=2.2, zorder=6))
     axes.plot(*plan.points.T, ".", color="0.6", ms=1.5, zorder=2)
     size = scale * _font(axes, plan)
-    sought = plan.of_class(target)
     for label in labels.of_plan(plan, [*sought, *colors], scale):
         color = colors.get(label.of, "black")
         _write(axes, label.text, label.x, -label.y, size, label.of in sought, color)

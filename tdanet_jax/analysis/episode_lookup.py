@@ -69,7 +69,7 @@ def find(
     away = math.hypot(x - start.x, z - start.z)
     if not away <= FARTHEST_START:  # so that NaN is refused, too
         raise ValueError(
-            f"start at x {start.x:g}, z {start.z:g}: {away:.2f} m from the nearest place to stand "
+            f"start at x {start.x:g}, z {start.z:g}: {away:.2f} m from the nearest reachable point "
             f"in {scene}, x {x:g}, z {z:g}; at most {FARTHEST_START} m"
         )
     if tables.distance[pose, goal] < 0:
@@ -83,11 +83,8 @@ def name_ranges(names: Sequence[str]) -> str:
     numbers = [int(name[len(stem) :] or -1) for name, stem in zip(names, stems, strict=True)]
     # Within a run of numbers, number minus index is constant.
     runs = itertools.groupby(range(len(names)), key=lambda i: (stems[i], numbers[i] - i))
-    parts = []
-    for _, members in runs:
-        first, *rest = members
-        parts.append(names[first] + (f"-{numbers[rest[-1]]}" if rest else ""))
-    return ", ".join(parts)
+    ends = [(run[0], run[-1]) for run in (list(members) for _, members in runs)]
+    return ", ".join(names[a] + (f"-{numbers[b]}" if b > a else "") for a, b in ends)
 
 
 def read_record(run: Path | str, index: int, tables: SceneTables) -> Recorded:
@@ -117,8 +114,8 @@ def _parse(row: dict[str, Any], tables: SceneTables) -> Recorded:
             raise ValueError(f"{name!r}: no action; there are {', '.join(ACTION_NAMES)}")
     actions = np.array([ACTION_NAMES.index(name) for name in row["actions"]], int)
     place = tables.position[poses.split(episode.pose[0]).position][[0, 2]]
-    here = bool(np.allclose(place, start[:2], atol=1e-3))
-    if not here or tables.distance[episode.pose[0], episode.target[0]] + 1 != row["L"]:
+    shortest = tables.distance[episode.pose[0], episode.target[0]] + 1
+    if not np.allclose(place, start[:2], atol=1e-3) or shortest != row["L"]:
         raise ValueError("recorded on other scene tables")
     if not len(actions):
         raise ValueError("no actions")

@@ -138,13 +138,12 @@ def class_pairs(pairs: ClassPairs, unseen: Collection[str], title: str, path: Pa
     value = np.where(pairs.frames >= MIN_FRAMES, pairs.attention, np.nan)
     kept = [g for g in range(len(pairs.targets)) if np.isfinite(value[g]).any()]
     value = value[kept]
-    # The seen classes with the greatest mean attention for any target, in the order of the targets
-    # that attend to them.
+    # The classes with the greatest mean attention for any target: first targets, then by name.
     best = np.nan_to_num(value, nan=-1.0).max(axis=0, initial=-1.0)
     columns = np.sort(np.argsort(-best, kind="stable")[: min(40, (best >= 0).sum())])
-    own = {name: i for i, name in enumerate(pairs.targets[g] for g in kept)}
-    order = sorted(columns, key=lambda c: (own.get(pairs.classes[c], len(own)), pairs.classes[c]))
-    value = value[:, order]
+    rows = {pairs.targets[g]: row for row, g in enumerate(kept)}
+    order = sorted(columns, key=lambda c: (rows.get(pairs.classes[c], len(rows)), pairs.classes[c]))
+    value, seen = value[:, order], [pairs.classes[c] for c in order]
     figure = Figure(figsize=(2.2 + 0.36 * len(order), 2.6 + 0.3 * len(kept)), layout="constrained")
     axes = figure.subplots()
     axes.patch.set(facecolor="white", hatch="////", edgecolor="0.8", linewidth=0)
@@ -152,16 +151,14 @@ def class_pairs(pairs: ClassPairs, unseen: Collection[str], title: str, path: Pa
         axes.imshow(value, cmap=SHADES, vmin=0, vmax=1, aspect="auto")
     for g, c in zip(*np.nonzero(value >= 0.095), strict=True):
         color = "white" if value[g, c] > 0.85 else "black"
-        text = f"{100 * value[g, c]:.0f}"
-        axes.text(c, g, text, ha="center", va="center", fontsize=7.5, color=color)
-    for row, g in enumerate(kept):
-        if pairs.targets[g] in (names := [pairs.classes[c] for c in order]):
-            column = names.index(pairs.targets[g])
-            corner = (column - 0.5, row - 0.5)
+        style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7.5, "color": color}
+        axes.text(c, g, f"{100 * value[g, c]:.0f}", **style)
+    for column, name in enumerate(seen):
+        if name in rows:
+            corner = (column - 0.5, rows[name] - 0.5)
             axes.add_patch(Rectangle(corner, 1, 1, fill=False, edgecolor="black", lw=1.6))
-    named = [pairs.targets[g] + ("*" if pairs.targets[g] in unseen else "") for g in kept]
-    axes.set_yticks(range(len(kept)), named, fontsize=9)
-    axes.set_xticks(range(len(order)), [pairs.classes[c] for c in order], fontsize=9, rotation=90)
+    axes.set_yticks(range(len(rows)), [name + "*" * (name in unseen) for name in rows], fontsize=9)
+    axes.set_xticks(range(len(seen)), seen, fontsize=9, rotation=90)
     axes.set(xlabel="class in view", ylabel="target")
     axes.spines[:].set_visible(False)
     bar = figure.colorbar(ScalarMappable(Normalize(0, 100), SHADES), ax=axes, pad=0.01, aspect=30)

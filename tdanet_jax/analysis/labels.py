@@ -36,12 +36,9 @@ class Label(NamedTuple):
 
 
 def place(
-    things: Sequence[tuple[str, Rectangle]],
-    size: float,
-    bounds: Rectangle,
-    centred: bool = False,
-    most: int | None = None,
-) -> list[Label]:
+    things: Sequence[tuple[str, Rectangle]], size: float, bounds: Rectangle,
+    centred: bool = False, most: int | None = None,
+) -> list[Label]:  # fmt: skip
     """Places names at their rectangles, in order; those without room are left out.
 
     Args:
@@ -51,22 +48,20 @@ def place(
       centred: tries the middle of a rectangle first instead of its corners.
       most: the greatest number of names.
     """
-    placed: list[Label] = []
-    taken: list[Rectangle] = []
-    margin = MARGIN * size
+    placed: dict[Rectangle, Label] = {}
+    margin, spots = MARGIN * size, _centred if centred else _cornered
     for number, (text, thing) in enumerate(things):
-        if len(placed) == most:
-            break
         width, height = extent(text, size)
-        spots = _centred if centred else _cornered
         for left, y in spots(thing, width, height):
             x = max(min(left, bounds[2] - margin - width), bounds[0] + margin)
             spot = (x, y, x + width, y + height)
-            if _inside(spot, bounds) and not any(_overlap(spot, other) for other in taken):
-                placed.append(Label(text, x, y, number))
-                taken.append(spot)
+            inside = bounds[1] <= y and spot[2] <= bounds[2] and spot[3] <= bounds[3]
+            if inside and not any(_overlap(spot, other) for other in placed):
+                placed[spot] = Label(text, x, y, number)
                 break
-    return placed
+        if len(placed) == most:
+            break
+    return [*placed.values()]
 
 
 def extent(text: str, size: float) -> tuple[float, float]:
@@ -100,10 +95,6 @@ def _centred(thing: Rectangle, width: float, height: float) -> Iterable[tuple[fl
     yield x, y
 
 
-def _inside(a: Rectangle, b: Rectangle) -> bool:
-    return a[0] >= b[0] and a[1] >= b[1] and a[2] <= b[2] and a[3] <= b[3]
-
-
 def _overlap(a: Rectangle, b: Rectangle) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
@@ -125,17 +116,14 @@ def of_view(
       attention: [n] weight of each object in view, or None.
       scale: of the font; with a smaller font there are more names.
     """
-    boxes = view.boxes
-    size = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-    rank = size if attention is None else attention + LEAST_ATTENTION * size
-    order = sorted(range(len(boxes)), key=lambda i: (view.classes[i] != target, -rank[i]))
+    weights = np.zeros(len(view.boxes)) if attention is None else attention
+    rank = weights + LEAST_ATTENTION * view.areas
+    order = sorted(range(len(rank)), key=lambda i: (view.classes[i] != target, -rank[i]))
     things = []
     for i in order:
-        text = view.classes[i]
-        if attention is not None and attention[i] >= LEAST_ATTENTION:
-            text += f" {100 * attention[i]:.0f}%"
-        x1, y1, x2, y2 = map(float, boxes[i])
-        things.append((text, (x1, y1, x2, y2)))
+        share = f" {100 * weights[i]:.0f}%" if weights[i] >= LEAST_ATTENTION else ""
+        x1, y1, x2, y2 = map(float, view.boxes[i])
+        things.append((view.classes[i] + share, (x1, y1, x2, y2)))
     placed = place(things, scale * VIEW_FONT, (0, 0, 1, 1), most=round(MOST_NAMES / scale**2))
     return [label._replace(of=order[label.of]) for label in placed]
 
@@ -148,12 +136,10 @@ def of_plan(plan: FloorPlan, first: Collection[int], scale: float = 1.0) -> list
       scale: of the font.
     """
     x1, z1, x2, z2 = plan.extent
-    chosen, named = list(first), {IGNORED, *(plan.classes[i] for i in first)}
-    for i, (name, outline) in enumerate(zip(plan.classes, plan.outlines, strict=True)):
-        if name not in named and floor_plan.area(outline) >= LEAST_AREA:
-            named.add(name)
-            chosen.append(i)
-    things = []
+    large = [i for i, outline in enumerate(plan.outlines) if floor_plan.area(outline) >= LEAST_AREA]
+    named = {IGNORED, *(plan.classes[i] for i in first)}
+    others = {name: i for i in large[::-1] if (name := plan.classes[i]) not in named}
+    chosen, things = [*first, *sorted(others.values())], []
     for i in chosen:
         (left, low), (right, high) = plan.outlines[i].min(axis=0), plan.outlines[i].max(axis=0)
         things.append((plan.classes[i], (float(left), float(-high), float(right), float(-low))))

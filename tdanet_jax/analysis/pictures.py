@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.animation import PillowWriter
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -30,112 +31,56 @@ if TYPE_CHECKING:
     from tdanet_jax.analysis.trace import Trace
 
 
-def attention_episode(
-    trace: Trace, tables: SceneTables, title: str, path: Path, most: int = 6
-) -> None:
+def attention_episode(trace: Trace, tables: SceneTables, path: Path, most: int = 6) -> None:
     """The camera's view at some steps of an episode, boxes shaded by attention, as in the paper."""
     count = len(trace.actions)
     steps = np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
-    columns = min(len(steps), 3)
-    rows = -(-len(steps) // columns)
-    figure = Figure(figsize=(3.9 * columns + 0.4, 4.1 * rows + 0.9))
-    grid = figure.subplots(rows, columns, squeeze=False)
-    figure.subplots_adjust(
-        left=0.01, right=0.99, wspace=0.04, hspace=0.13,
-        bottom=0.62 / (4.1 * rows + 0.9), top=1 - 0.75 / (4.1 * rows + 0.9),
-    )  # fmt: skip
-    for axes in grid.flat[len(steps) :]:
-        axes.set_axis_off()
-    for axes, step in zip(grid.flat, steps, strict=False):
+    title = f"{trace.player}: {trace.target} in {trace.scene}\n{trace.outcome}"
+    widths = [3.9] * min(len(steps), 3)
+    figure, panels = _panels(len(steps), widths, 3.9, title, _view_handles(trace))
+    for axes, step in zip(panels, steps, strict=True):
         seen = camera_view.of_pose(tables, int(trace.pose[step]))
         weights = None if trace.attention is None else trace.attention[step]
         drawing.draw_view(axes, seen, weights, trace.target)
         axes.set_title(_decision(trace, step), fontsize=10)
-    figure.suptitle(f"{title}\n{trace.outcome}", fontsize=11, y=0.995, va="top")
-    handles = _view_handles(trace)
-    figure.legend(handles=handles, loc="lower center", ncols=5, frameon=False, fontsize=9)
     drawing.save(figure, path)
-
-
-def _view_handles(trace: Trace) -> list[Patch]:
-    """What the legend of a camera's view explains."""
-    near = Patch(fill=False, edgecolor="black", lw=2.6, label=f"{trace.target}, within 1.5 m")
-    far = Patch(fill=False, edgecolor="black", lw=2.6, ls=DASHED, label=f"{trace.target}, farther")
-    if trace.attention is None:
-        return [near, far, Patch(fill=False, edgecolor=FRAME, label="this agent has no attention")]
-    shades = ((0.1, "attention 10 %"), (0.5, "50 %"), (1.0, "100 %"))
-    return [near, far, *(Patch(fc=SHADES(share), ec=FRAME, label=label) for share, label in shades)]
-
-
-def _decision(trace: Trace, step: int) -> str:
-    """A step's number and action, with its probability if there is one."""
-    action = trace.actions[step]
-    said = f"step {step + 1}: {ACTION_NAMES[action]}"
-    if trace.probabilities is not None:
-        said += f" ({100 * trace.probabilities[step, action]:.0f} %)"
-    return said
 
 
 def trajectories(traces: Sequence[Trace], plan: FloorPlan, tables: SceneTables, path: Path) -> None:
     """The paths of one or several players through the same episode, a floor plan each."""
     x1, z1, x2, z2 = plan.extent
-    columns = min(len(traces), 3)
-    rows = -(-len(traces) // columns)
     scale = 5.2 / max(x2 - x1, z2 - z1)  # inches per metre
-    wide, high = max(scale * (x2 - x1), 3.2), scale * (z2 - z1)
-    size = (columns * (wide + 0.1), rows * (high + 0.5) + 0.85)
-    figure = Figure(figsize=size)
-    grid = figure.subplots(rows, columns, squeeze=False)
-    figure.subplots_adjust(
-        left=0.01, right=0.99, wspace=0.03, hspace=0.5 / high,
-        bottom=0.55 / size[1], top=1 - 0.72 / size[1],
-    )  # fmt: skip
-    for axes in grid.flat[len(traces) :]:
-        axes.set_axis_off()
-    for axes, trace in zip(grid.flat, traces, strict=False):
+    dot: dict[str, Any] = {"color": ORANGE, "ls": "", "markeredgecolor": "black"}
+    handles = [
+        Line2D([], [], marker="o", mfc="white", color=ORANGE, mew=2, ls="", label="start"),
+        Line2D([], [], color=ORANGE, lw=2.5, label="path, with numbers of steps"),
+        _FIELD_OF_VIEW,
+        Line2D([], [], marker="*", ms=13, **dot, label="success"),
+        Line2D([], [], marker="X", ms=9, **dot, label="failure"),
+        Patch(fill=False, edgecolor="black", lw=2.2, label=traces[0].target),
+    ]
+    widths = [max(scale * (x2 - x1), 3.2)] * min(len(traces), 3)
+    title = f"{traces[0].target} in {traces[0].scene}"
+    figure, panels = _panels(len(traces), widths, scale * (z2 - z1), title, handles)
+    for axes, trace in zip(panels, traces, strict=True):
         drawing.draw_plan(axes, plan, trace.target)
         drawing.draw_path(axes, trace, plan, tables)
         axes.set_title(f"{trace.player}\n{trace.outcome}", fontsize=9.5)
-    first = traces[0]
-    figure.suptitle(f"{first.target} in {first.scene}", fontsize=12, y=0.995, va="top")
-    dot: dict[str, Any] = {"color": ORANGE, "ls": "", "markeredgecolor": "black"}
-    figure.legend(
-        handles=[
-            Line2D([], [], marker="o", mfc="white", color=ORANGE, mew=2, ls="", label="start"),
-            Line2D([], [], color=ORANGE, lw=2.5, label="path, with numbers of steps"),
-            _FIELD_OF_VIEW,
-            Line2D([], [], marker="*", ms=13, **dot, label="success"),
-            Line2D([], [], marker="X", ms=9, **dot, label="failure"),
-            Patch(fill=False, edgecolor="black", lw=2.2, label=first.target),
-        ],
-        loc="lower center", ncols=6 if columns > 1 else 3, frameon=False, fontsize=8.5,
-    )  # fmt: skip
     drawing.save(figure, path)
-
-
-_FIELD_OF_VIEW = Patch(facecolor=ORANGE, alpha=0.25, label="field of view to 1.5 m")
 
 
 def animation(traces: Sequence[Trace], plan: FloorPlan, tables: SceneTables, path: Path) -> None:
     """The growing path next to the camera's view, a row for each player, as an animated GIF."""
     x1, z1, x2, z2 = plan.extent
-    high = 4.1  # inches, of a row's drawings
-    wide = high * (x2 - x1) / (z2 - z1)
-    size = (wide + high + 0.3, len(traces) * (high + 0.4) + 0.6)
-    figure = Figure(figsize=size)
-    grid = figure.subplots(len(traces), 2, squeeze=False, width_ratios=(wide, high))
-    figure.subplots_adjust(
-        left=0.1 / size[0], right=1 - 0.1 / size[0], wspace=0.2 / (wide + high), hspace=0.4 / high,
-        bottom=0.4 / size[1], top=1 - 0.6 / size[1],
-    )  # fmt: skip
-    first, last = traces[0], max(len(trace.actions) for trace in traces)
-    figure.suptitle(f"{first.target} in {first.scene}", fontsize=12, y=1 - 0.05 / size[1], va="top")
-    handles = [_FIELD_OF_VIEW, *_view_handles(first)]
-    figure.legend(handles=handles, loc="lower center", ncols=6, frameon=False, fontsize=9)
-    writer = PillowWriter(fps=2)
+    high = 4.1  # inches
+    title = f"{traces[0].target} in {traces[0].scene}"
+    handles = [_FIELD_OF_VIEW, *_view_handles(traces[0])]
+    widths = [high * (x2 - x1) / (z2 - z1), high]
+    figure, panels = _panels(2 * len(traces), widths, high, title, handles)
+    last, writer = max(len(trace.actions) for trace in traces), PillowWriter(fps=2)
     with files.replacing(path) as fresh, writer.saving(figure, fresh, drawing.DPI):
         for step in [*range(last + 1), *[last] * 5]:  # the end stays for three seconds
-            for (left, right), trace in zip(grid, traces, strict=True):
+            for left, right, trace in zip(panels[::2], panels[1::2], traces, strict=True):
                 _draw_step(left, right, trace, min(step, len(trace.actions)), plan, tables)
             writer.grab_frame()
 
@@ -155,6 +100,54 @@ def _draw_step(
     drawing.draw_view(right, seen, weights, trace.target)
     left.set_title(trace.player, fontsize=10)
     right.set_title(_decision(trace, step) if step == decided else trace.outcome, fontsize=10)
+
+
+def _decision(trace: Trace, step: int) -> str:
+    """A step's number and action, with its probability if there is one."""
+    action = trace.actions[step]
+    said = f"step {step + 1}: {ACTION_NAMES[action]}"
+    if trace.probabilities is not None:
+        said += f" ({100 * trace.probabilities[step, action]:.0f} %)"
+    return said
+
+
+_FIELD_OF_VIEW = Patch(facecolor=ORANGE, alpha=0.25, label="field of view to 1.5 m")
+
+
+def _view_handles(trace: Trace) -> list[Patch]:
+    """The legend of a camera's view."""
+    near = Patch(fill=False, edgecolor="black", lw=2.6, label=f"{trace.target}, within 1.5 m")
+    far = Patch(fill=False, edgecolor="black", lw=2.6, ls=DASHED, label=f"{trace.target}, farther")
+    if trace.attention is None:
+        return [near, far, Patch(fill=False, edgecolor=FRAME, label="this agent has no attention")]
+    shades = ((0.1, "attention 10 %"), (0.5, "50 %"), (1.0, "100 %"))
+    return [near, far, *(Patch(fc=SHADES(share), ec=FRAME, label=label) for share, label in shades)]
+
+
+def _panels(
+    count: int, widths: Sequence[float], high: float, title: str, handles: Sequence[Artist],
+    margin: float = 0.0,
+) -> tuple[Figure, Sequence[Axes]]:  # fmt: skip
+    """A figure with rows of panels, `widths` and `high` inches in size, and a legend.
+
+    Args:
+      margin: inches for the ticks to the left of the panels and below them.
+    """
+    columns, rows, wide = len(widths), -(-count // len(widths)), sum(widths)
+    ncols, below = (6, 0.4 + margin) if wide > 7 else (3, 0.55 + margin)
+    above = 0.45 + 0.25 * len(title.splitlines())
+    size = (margin + wide + 0.1 * (columns + 1), rows * (high + 0.5) - 0.5 + below + above)
+    figure = Figure(figsize=size)
+    grid = figure.subplots(rows, columns, squeeze=False, width_ratios=widths)
+    figure.subplots_adjust(
+        left=(margin + 0.1) / size[0], right=1 - 0.1 / size[0], wspace=0.1 * columns / wide,
+        bottom=below / size[1], top=1 - above / size[1], hspace=0.5 / high,
+    )  # fmt: skip
+    figure.suptitle(title, fontsize=12, y=1 - 0.05 / size[1], va="top")
+    figure.legend(handles=handles, loc="lower center", ncols=ncols, frameon=False, fontsize=8.5)
+    for axes in grid.flat[count:]:
+        axes.set_axis_off()
+    return figure, list(grid.flat[:count])
 
 
 def most_telling_state(tables: SceneTables) -> int:
@@ -180,28 +173,25 @@ def room(scene: Scene, tables: SceneTables, state: int, path: Path) -> None:
     rows = slice(tables.row_start[state], tables.row_start[state + 1])
     visible = dict(zip(tables.row_object[rows], tables.row_visible[rows], strict=True))
     colors = {i: _COLORS[visible[k]] for i, k in enumerate(plan.objects) if k in visible}
-    figure = Figure(figsize=(14, 6.9))
-    left, right = figure.subplots(1, 2)
-    figure.subplots_adjust(left=0.04, right=0.99, bottom=0.07, top=0.94, wspace=0.05)
+    x1, z1, x2, z2 = plan.extent
+    high = 6.0  # inches
+    handles = [
+        Patch(fill=False, edgecolor=GREEN, lw=1.5, label="visible within 1.5 m"),
+        Patch(fill=False, edgecolor=BLUE, lw=1.5, label="in view, farther"),
+    ]
+    widths = [high * (x2 - x1) / (z2 - z1), high]
+    figure, (left, right) = _panels(2, widths, high, scene.name, handles, margin=0.5)
     drawing.draw_plan(left, plan, None, colors, scale=0.75)
-    for low, high in void_boxes(scene, RULES):
-        left.add_patch(Rectangle(low[[0, 2]], *(high - low)[[0, 2]], color="0.85", lw=0))
+    for low, top in void_boxes(scene, RULES):
+        left.add_patch(Rectangle(low[[0, 2]], *(top - low)[[0, 2]], color="0.85", lw=0))
     drawing.draw_agent(left, (x, z), rotation)
     left.xaxis.set_major_locator(MultipleLocator())
     left.yaxis.set_major_locator(MultipleLocator())
     left.set(xlabel="x, m", ylabel="z, m")
-    counts = f"{len(plan.points)} reachable points, {len(scene.objects)} objects"
-    left.set_title(f"{scene.name}: {counts}")
+    left.set_title(f"{len(plan.points)} reachable points, {len(scene.objects)} objects")
     drawing.draw_view(right, seen, None, None, [_COLORS[near] for near in seen.visible], 0.7)
     where = f"x {x:.2f}, z {z:.2f}, rotation {rotation}, horizon {horizon}"
     right.set_title(f"{len(seen.classes)} objects in view from {where}")
-    figure.legend(
-        handles=[
-            Patch(fill=False, edgecolor=GREEN, lw=1.5, label="visible within 1.5 m"),
-            Patch(fill=False, edgecolor=BLUE, lw=1.5, label="in view, farther"),
-        ],
-        loc="lower right", ncols=2, frameon=False,
-    )  # fmt: skip
     drawing.save(figure, path)
 
 

@@ -17,7 +17,6 @@ from tdanet_jax.scenes.floor_plan import FloorPlan
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
 
-TEMPLATE = "replay.html"
 #: Where the template takes the episode.
 SLOT = "{{EPISODE}}"
 #: Units of the page's drawings: the width of the camera's view, and a metre on the plan.
@@ -44,11 +43,18 @@ def page(traces: Sequence[Trace], tables: SceneTables) -> str:
         "shortest": first.shortest,
         "actions": ACTION_NAMES,
         "plan": _plan(plan, first.target, SMALL_PLAN if len(traces) > 1 else 1.0),
-        "players": [_player(trace, tables) for trace in traces],
+        "players": [
+            {
+                "name": trace.player,
+                "outcome": trace.outcome,
+                "success": trace.success,
+                "attends": trace.attention is not None,
+                "steps": [_step(trace, tables, i) for i in range(len(trace.pose))],
+            }
+            for trace in traces
+        ],
     }
-    template = (
-        importlib.resources.files("tdanet_jax.analysis").joinpath(TEMPLATE).read_text("utf-8")
-    )
+    template = importlib.resources.files(__package__).joinpath("replay.html").read_text("utf-8")
     return template.replace(SLOT, embed(episode))
 
 
@@ -76,16 +82,6 @@ def _plan(plan: FloorPlan, target: str, scale: float) -> dict[str, Any]:
             [label.text, round(METRE * label.x), round(METRE * label.y), plan.classes[label.of]]
             for label in labels.of_plan(plan, plan.of_class(target), scale)
         ],
-    }
-
-
-def _player(trace: Trace, tables: SceneTables) -> dict[str, Any]:
-    return {
-        "name": trace.player,
-        "outcome": trace.outcome,
-        "success": trace.success,
-        "attends": trace.attention is not None,
-        "steps": [_step(trace, tables, i) for i in range(len(trace.pose))],
     }
 
 

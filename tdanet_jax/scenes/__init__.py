@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tdanet_jax.scenes.cache import load_tables
-from tdanet_jax.scenes.errors import SceneError
+from tdanet_jax.scenes.scene import SceneError
 from tdanet_jax.scenes.tables import SceneTables
 
 __all__ = ["SceneError", "SceneTables", "load_tables"]

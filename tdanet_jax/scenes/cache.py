@@ -37,7 +37,6 @@ _MODULES = (
     "scenes.visibility.geometry",
     "scenes.visibility.rays",
     "scenes.visibility.solids",
-    "scenes.visibility.raster",
     "scenes.visibility.build",
     "scenes.tables",
     "scenes.tabulation",

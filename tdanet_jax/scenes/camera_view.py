@@ -16,6 +16,12 @@ class CameraView(NamedTuple):
     boxes: np.ndarray  # [n, 4] x1, y1, x2, y2 as shares of the image, y down
     visible: np.ndarray  # [n] bool, in the sense of the task: within 1.5 m
 
+    @property
+    def areas(self) -> np.ndarray:
+        """Areas [n] of the boxes, as shares of the image."""
+        x1, y1, x2, y2 = self.boxes.T
+        return (x2 - x1) * (y2 - y1)
+
 
 def of_pose(tables: SceneTables, pose: int) -> CameraView:
     """What is in view from a pose."""

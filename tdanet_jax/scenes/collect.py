@@ -12,7 +12,7 @@ from typing import Any
 
 from tdanet_jax.io import files
 from tdanet_jax.poses import GRID_SIZE
-from tdanet_jax.scenes.errors import SceneError
+from tdanet_jax.scenes.scene import SceneError
 
 FIELDS = (
     "objectId", "objectType", "axisAlignedBoundingBox", "objectOrientedBoundingBox", "rotation",

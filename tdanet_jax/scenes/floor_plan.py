@@ -8,8 +8,7 @@ import numpy as np
 
 from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes import ithor
-from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.scene import Scene
+from tdanet_jax.scenes.scene import Scene, SceneError
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.visibility.geometry import box_frame
 
@@ -66,13 +65,11 @@ def of_room(tables: SceneTables, name: str) -> FloorPlan:
     if name not in tables.scenes:
         raise SceneError(f"{name}: no such room in these tables")
     room = tables.subset([name]).as_scene()
+    ids = [item.object_id for item in room.objects]
     for bundled in ithor.load_scenes():
-        if bundled.name == name and _object_ids(bundled) == _object_ids(room):
+        if bundled.name == name and [item.object_id for item in bundled.objects] == ids:
             return of_scene(dataclasses.replace(bundled, points=room.points))
     return of_scene(room)
-
-
-load = of_room  # its former name
 
 
 def area(outline: np.ndarray) -> float:
@@ -92,7 +89,3 @@ def _outline(scene: Scene, k: int) -> np.ndarray:
         level = edges[[0, 2]]
     a, b = level
     return np.array([origin, origin + a, origin + a + b, origin + b])[:, [0, 2]]
-
-
-def _object_ids(scene: Scene) -> list[str]:
-    return [item.object_id for item in scene.objects]

@@ -20,9 +20,8 @@ import numpy as np
 from tdanet_jax.io import archive, assets
 from tdanet_jax.io.untrusted import npz
 from tdanet_jax.poses import GRID_SIZE
-from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.metadata import parse_scene
-from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene, SceneObject
+from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene, SceneError, SceneObject
 from tdanet_jax.scenes.visibility.geometry import box_frame, frustum_rotation, lattice
 from tdanet_jax.splits import SCENE_NUMBERS
 from tdanet_jax.vocabulary import ROOM_TYPES, VISIBILITY_DISTANCE

@@ -28,8 +28,7 @@ from typing import Any
 import numpy as np
 
 from tdanet_jax.poses import GRID_SIZE
-from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.scenes.scene import Scene, SceneError, SceneObject
 from tdanet_jax.splits import PARTS
 from tdanet_jax.vocabulary import IGNORED, ROOM_TYPES
 

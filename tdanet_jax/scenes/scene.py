@@ -11,6 +11,14 @@ SUBPIXEL = 16  # boxes are stored in sixteenths of a pixel
 CAMERA_ABOVE_AGENT = 0.675  # metres from the agent's y to its camera, AI2-THOR's default agent
 
 
+class SceneError(ValueError):
+    """A scene breaks a rule; the message is one line that names scene, object and rule."""
+
+    def __init__(self, message: str) -> None:
+        # Names come from files and may contain line breaks.
+        super().__init__(" ".join(message.split()))
+
+
 @dataclass(frozen=True, eq=False)
 class SceneObject:
     """One object of a room. Lengths in metres, y up, AI2-THOR's left-handed world axes."""

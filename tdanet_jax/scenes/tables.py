@@ -20,8 +20,7 @@ from tdanet_jax import poses
 from tdanet_jax.io import archive
 from tdanet_jax.io.untrusted import npz
 from tdanet_jax.poses import VIEWS
-from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene, SceneObject
+from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene, SceneError, SceneObject
 from tdanet_jax.vocabulary import FIELD_OF_VIEW, IMAGE_SIZE
 
 #: Field -> dtype, shape, least value, and the axis that its values are indices of. In addition to

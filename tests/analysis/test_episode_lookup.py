@@ -47,14 +47,14 @@ def test_what_is_not_there_is_refused_with_what_is(ithor, arguments, message):
     assert "\n" not in str(refused.value)
 
 
-def test_a_start_far_from_every_place_to_stand_is_refused_with_the_nearest(ithor):
+def test_a_start_far_from_every_reachable_point_is_refused_with_the_nearest(ithor):
     here = ithor.position_scene == ithor.scenes.index("FloorPlan228")
     x, _, z = min(ithor.position[here].tolist())
     find(ithor, "FloorPlan228", "Laptop", Start(x - 0.5, z, 0))
     with pytest.raises(ValueError, match="start at") as refused:
         find(ithor, "FloorPlan228", "Laptop", Start(x - 1, z, 0))
     assert str(refused.value) == (
-        f"start at x {x - 1:g}, z {z:g}: 1.00 m from the nearest place to stand in FloorPlan228, "
+        f"start at x {x - 1:g}, z {z:g}: 1.00 m from the nearest reachable point in FloorPlan228, "
         f"x {x:g}, z {z:g}; at most 0.5 m"
     )
     with pytest.raises(ValueError, match="start at x nan"):

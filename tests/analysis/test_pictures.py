@@ -46,7 +46,7 @@ def test_an_animation_has_a_frame_for_each_step_and_stays_at_the_end(some_rooms,
 
 
 def test_views_of_an_episode_without_attention(some_rooms, tmp_path):
-    pictures.attention_episode(walk(some_rooms, True), some_rooms, "A", tmp_path / "views.png")
+    pictures.attention_episode(walk(some_rooms, True), some_rooms, tmp_path / "views.png")
     assert imread(tmp_path / "views.png").std() > 0.01
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax.io.untrusted.errors import FileError
+from tdanet_jax.io.untrusted import FileError
 
 #: Numbers in the largest dataset that is read; a feature map has 512 x 7 x 7.
 LARGEST = 1 << 22
@@ -29,10 +29,6 @@ class Reader:
         """Names at the top level of the file."""
         with _plain_errors(self._path):
             return [str(name) for name in self._file]
-
-    def __contains__(self, name: str) -> bool:
-        with _plain_errors(self._path):
-            return name in self._file
 
     def read(self, name: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
         """The numbers of a dataset.

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
-from tdanet_jax.io.untrusted.errors import FileError
+from tdanet_jax.io.untrusted import FileError
 
 #: Bytes of the largest file that is read; the raw metadata of one scene is some hundred million.
 LARGEST = 2 << 30

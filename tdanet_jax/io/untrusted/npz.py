@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from tdanet_jax.io.untrusted.errors import FileError
+from tdanet_jax.io.untrusted import FileError
 
 LARGEST = 1 << 32  # bytes of the largest array that is read
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax.io.untrusted.errors import FileError
+from tdanet_jax.io.untrusted import FileError
 
 #: Numbers in the largest array, and bytes of the largest file that is read.
 LARGEST, LARGEST_FILE = 1 << 24, 1 << 30

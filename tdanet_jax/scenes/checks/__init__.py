@@ -1,1 +1,1 @@
-"""Checks of rooms: agreement with AI2-THOR, consistency, and a survey before training."""
+"""Checks of rooms: agreement with AI2-THOR, and a survey before training."""

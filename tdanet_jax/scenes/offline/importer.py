@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import json
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +25,8 @@ from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.tabulation import join, tabulate
 from tdanet_jax.vocabulary import ALL_TARGETS
 
-SOURCES = (
-    layout.GRID_FILE,
-    layout.GRAPH_FILE,
-    layout.BOX_FILE,
-    layout.OBJECT_FILE,
-    *layout.VISIBILITY_FILES,
-)
+SOURCES = (layout.GRID_FILE, layout.GRAPH_FILE, layout.BOX_FILE, layout.OBJECT_FILE,
+           *layout.VISIBILITY_FILES)  # fmt: skip
 #: Version of the cached scenes, and part of their name.
 FORMAT = 2
 
@@ -63,35 +57,18 @@ def read_folder(folder: Path, report: Report) -> Rooms:
         if other.is_dir() and layout.scene_of(other.name) is None:
             report(1.0, f"{other.name}: left out, not one of iTHOR's 120 rooms")
     grids = {room.scenes[0]: Grid(room.position) for room in rooms}
-    extras, lines = read_extras(_near(folder, root), grids)
+    # The reference keeps its test episodes two folders above the scenes.
+    places = [root, folder, folder / "data", *root.resolve().parents[:2]]
+    extras, lines = read_extras(places, grids)
     for line in lines:
         report(1.0, line)
-    result = Rooms(join_rooms(root, rooms), extras)
-    lost = {p for targets in extras.parents.values() for names in targets.values() for p in names}
-    if lost := lost - set(result.tables.classes):
-        report(
-            1.0, f"parents that are no class of these rooms, left out: {', '.join(sorted(lost))}"
-        )
-    return result
-
-
-def _near(folder: Path, root: Path) -> list[Path]:
-    """Where extras are searched for, nearest first: the reference keeps its test episodes two
-    folders above the scenes."""
-    places = [root, folder, folder / "data", root.resolve().parent, root.resolve().parent.parent]
-    return list(dict.fromkeys(places))
-
-
-def join_rooms(root: Path, rooms: Sequence[SceneTables]) -> SceneTables:
-    """The tables of all rooms, with all their classes, and the targets among these.
-
-    Raises:
-      FileError: there are more classes than the raster can number.
-    """
     classes = sorted({name for room in rooms for name in room.classes})
     if len(classes) > MOST_CLASSES:
         raise FileError(root, f"{len(classes)} classes, more than {MOST_CLASSES}")
-    return join(rooms, classes).with_known_targets()
+    named = {p for targets in extras.parents.values() for names in targets.values() for p in names}
+    if unknown := ", ".join(sorted(named - set(classes))):
+        report(1.0, f"parents that are no class of these rooms, left out: {unknown}")
+    return Rooms(join(rooms, classes).with_known_targets(), extras)
 
 
 def _cache_folder(root: Path) -> Path:

@@ -12,12 +12,11 @@ import numpy as np
 from tdanet_jax import poses
 from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.poses import GRID_SIZE, HORIZONS, ROTATIONS, STEPS, VIEWS
-from tdanet_jax.scenes.errors import SceneError
 from tdanet_jax.scenes.metadata import FARTHEST, check_points
 from tdanet_jax.scenes.offline import layout
 from tdanet_jax.scenes.offline.layout import Grid
 from tdanet_jax.scenes.offline.matching import MOST_OBJECTS, UNKNOWN, BoxMatcher, Objects
-from tdanet_jax.scenes.scene import SUBPIXEL, Scene
+from tdanet_jax.scenes.scene import SUBPIXEL, Scene, SceneError
 from tdanet_jax.scenes.visibility.build import Detections
 from tdanet_jax.scenes.visibility.geometry import transitions
 from tdanet_jax.vocabulary import IMAGE_SIZE

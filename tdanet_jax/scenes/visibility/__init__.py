@@ -1,1 +1,1 @@
-"""From the boxes of objects to detections: solids, rays, rasters."""
+"""From the boxes of objects to detections: solids and rays."""

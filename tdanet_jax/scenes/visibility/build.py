@@ -8,7 +8,7 @@ defines to the last bit, so that tables are equal on every machine.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,16 +29,8 @@ def turned(x: np.ndarray, z: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Coordinates to the right of and ahead of a level camera, for each of the eight rotations."""
     half = np.sqrt(np.float32(0.5))
     plus, minus = (x + z) * half, (x - z) * half
-    return [
-        (x, z),
-        (minus, plus),
-        (-z, x),
-        (-plus, minus),
-        (-x, -z),
-        (-minus, -plus),
-        (z, -x),
-        (plus, -minus),
-    ]
+    half_turn = [(x, z), (minus, plus), (-z, x), (-plus, minus)]
+    return half_turn + [(-right, -ahead) for right, ahead in half_turn]
 
 
 def tilted(up: np.ndarray, ahead: np.ndarray, horizon: int) -> tuple[np.ndarray, np.ndarray]:
@@ -57,8 +49,7 @@ def project(across: np.ndarray, depth: np.ndarray) -> np.ndarray:
     return across * (np.float32(IMAGE_SIZE * SUBPIXEL / 2) / np.maximum(depth, np.float32(1)))
 
 
-@dataclass(frozen=True, eq=False)
-class Detections:
+class Detections(NamedTuple):
     """The detections of one room: one row per state and object in view, sorted by both."""
 
     state: np.ndarray  # [N] int32
@@ -132,12 +123,13 @@ def _boxes_in_view(
         nothing hides, sorted.
       least: [P * O] area in view from which on an object counts as visible.
     """
-    area, owner = patches.area[patch], patches.owner[patch]
+    area, owners = patches.area[patch], patches.owner[patch]
     center, corner, eye = (a.astype(np.float32) for a in (patches.center, patches.corner, cameras))
     x, up, z = (center[patch, axis] - eye[position, axis] for axis in range(3))
     corners, eyes = turned(corner[..., 0], corner[..., 2]), turned(eye[:, 0], eye[:, 2])
     corners_up, eyes_up = np.ascontiguousarray(corner[..., 1]), np.ascontiguousarray(eye[:, 1])
-    parts = [_no_detections()]
+    none = np.zeros(0, np.int32)
+    parts = [(none, none, np.zeros((0, 4), np.int16), np.zeros(0, bool))]
     for heading, (right, ahead) in enumerate(turned(x, z)):
         for horizon in range(HORIZONS):
             height, depth = tilted(up, ahead, horizon)
@@ -157,21 +149,12 @@ def _boxes_in_view(
             state = poses.join(position[first], heading, horizon)
             box = _extents(across, *tilted(over, along, horizon), start)
             visible = np.add.reduceat(area[rows], start) >= least[group[first]]
-            parts.append(Detections(state, owner[first], box, visible))
-    order = np.lexsort(
-        (np.concatenate([p.owner for p in parts]), np.concatenate([p.state for p in parts]))
-    )
+            parts.append((state, owners[first], box, visible))
+    state, owner, box, visible = map(np.concatenate, zip(*parts, strict=True))
+    order = np.lexsort((owner, state))
     return Detections(
-        state=np.concatenate([p.state for p in parts])[order].astype(np.int32),
-        owner=np.concatenate([p.owner for p in parts])[order].astype(np.int32),
-        box=np.concatenate([p.box for p in parts])[order],
-        visible=np.concatenate([p.visible for p in parts])[order],
+        state[order].astype(np.int32), owner[order].astype(np.int32), box[order], visible[order]
     )
-
-
-def _no_detections() -> Detections:
-    none = np.zeros(0, np.int32)
-    return Detections(none, none, np.zeros((0, 4), np.int16), np.zeros(0, bool))
 
 
 def _extents(

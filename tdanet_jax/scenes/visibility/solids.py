@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdanet_jax.scenes.errors import SceneError
-from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.scenes.scene import Scene, SceneError, SceneObject
 from tdanet_jax.scenes.visibility.geometry import box_frame
 from tdanet_jax.scenes.visibility.rays import CLOSED, FARTHEST, MOST_SOLIDS, OPEN, TURN_BITS, Solids
 from tdanet_jax.scenes.visibility.rules import Rules

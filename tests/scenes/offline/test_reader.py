@@ -38,7 +38,7 @@ def rows(data: SceneData) -> set[tuple[int, str, tuple[float, ...], bool]]:
     """State, object, box in pixels, and whether it is visible, of every row."""
     return {
         (int(s), data.scene.objects[o].object_id, tuple((b / 16).tolist()), bool(v))
-        for s, o, b, v in zip(*vars(data.detections).values(), strict=True)
+        for s, o, b, v in zip(*data.detections, strict=True)
     }
 
 
