@@ -1,9 +1,9 @@
 """The 120 iTHOR rooms: built from published metadata into one compact file, and read from it.
 
 Two packages on PyPI describe the rooms: `procthor` contains AI2-THOR's object metadata of one
-default frame per room, `alfworld` the reachable points on the 0.25 m grid. `build_asset` combines
-them into `ithor.npz`, which `load_scenes` reads. The metadata do not say where the agent is in a
-default frame: that follows from its distances to all objects.
+default frame per room, `alfworld` most of the reachable points on the 0.25 m grid; `reachable` adds
+the others. `build_asset` combines them into `ithor.npz`, which `load_scenes` reads. The metadata do
+not say where the agent is in a default frame: that follows from its distances to all objects.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from tdanet_jax.io import archive, assets
 from tdanet_jax.io.untrusted import npz
 from tdanet_jax.poses import GRID_SIZE
+from tdanet_jax.scenes import reachable
 from tdanet_jax.scenes.metadata import parse_scene
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, Scene, SceneError, SceneObject
 from tdanet_jax.scenes.visibility.geometry import box_frame, frustum_rotation, lattice
@@ -69,7 +70,8 @@ def build_asset(procthor_wheel: Path, alfworld_wheel: Path, out_dir: Path) -> Pa
                     io.BytesIO(wheel.read(LAYOUT.format(name=name))), allow_pickle=False
                 )
                 scene = _room(name, room_type, metadata[f"{room}s"][offset], layout)
-                rooms.append(_room_arrays(scene))
+                added = reachable.complete(scene.points, scene.objects)
+                rooms.append(_room_arrays(scene, added))
     scene_keys = ("name", "room_type", "default_position", "default_rotation")
     arrays = {f"scene_{key}": np.array([room[key] for room in rooms]) for key in scene_keys}
     for key in rooms[0]:
@@ -92,7 +94,7 @@ def _whole(lengths: Any) -> np.ndarray:
 
 
 def _room(name: str, room_type: int, records: list[dict[str, Any]], layout: np.ndarray) -> Scene:
-    """A room from its metadata and its reachable points (x, z)."""
+    """A room from its metadata and its published points (x, z)."""
     agent = locate_agent(records)
     grid = np.rint(layout / GRID_SIZE) * GRID_SIZE
     if len(grid) == 0 or np.abs(grid - layout).max() > 1e-3:
@@ -102,8 +104,8 @@ def _room(name: str, room_type: int, records: list[dict[str, Any]], layout: np.n
     return dataclasses.replace(scene, default_rotation=_default_rotation(scene))
 
 
-def _room_arrays(scene: Scene) -> dict[str, Any]:
-    """A room as arrays of whole numbers."""
+def _room_arrays(scene: Scene, added: np.ndarray) -> dict[str, Any]:
+    """A room as arrays of whole numbers: its points, which are published, and those added."""
     items = scene.objects
     corners = [item.corners for item in items if item.corners is not None]
     row = {item.object_id: i for i, item in enumerate(items)}
@@ -113,7 +115,8 @@ def _room_arrays(scene: Scene) -> dict[str, Any]:
         "room_type": np.int8(scene.room_type),
         "default_position": _whole(scene.default_position),
         "default_rotation": np.int16(scene.default_rotation or 0),
-        "point": _whole(scene.points),
+        "point": _whole(np.concatenate([scene.points, added])),
+        "point_published": np.repeat([True, False], [len(scene.points), len(added)]),
         "object_id": np.array([item.object_id.encode() for item in items]),
         "object_class": np.array([item.object_class.encode() for item in items]),
         "object_box": _whole([item.box for item in items]),
@@ -143,6 +146,13 @@ def _default_rotation(scene: Scene) -> int:
     points = lattice(np.reshape(origins, (-1, 3)), np.reshape(edges, (-1, 3, 3)))
     camera = agent + np.array([0, CAMERA_ABOVE_AGENT, 0])
     return frustum_rotation(points, np.array(visible, bool), camera)
+
+
+def published_points() -> dict[str, np.ndarray]:
+    """Which points of each bundled room are published, rather than added: name -> [P] bool."""
+    data = npz.read(assets.path(ASSET))
+    parts = np.split(data["point_published"], np.cumsum(data["scene_points"])[:-1])
+    return {name.decode(): part for name, part in zip(data["scene_name"], parts, strict=True)}
 
 
 def load_scenes(path: Path | None = None) -> list[Scene]:

@@ -15,7 +15,7 @@ import pytest
 from tdanet_jax import poses
 from tdanet_jax.io import assets
 from tdanet_jax.io.untrusted import npz
-from tdanet_jax.scenes import SceneError, ithor, metadata
+from tdanet_jax.scenes import SceneError, ithor, metadata, reachable
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT
 from tdanet_jax.scenes.visibility import geometry
 from tdanet_jax.splits import SCENE_NUMBERS
@@ -87,7 +87,12 @@ def test_written_and_read_back(wheels: tuple[Path, Path], tmp_path: Path) -> Non
         assert scene.name == f"FloorPlan{SCENE_NUMBERS[room][number]}"
         agent = [0.25 * (SCENE_NUMBERS[room][number] % 4), 0.9, -0.5]
         assert np.allclose(scene.default_position, agent, atol=1e-4)
-        assert scene.points.round(4).tolist() == [[0, 0.9, -0.25], [0, 0.9, 0], [0.25, 0.9, 0.5]]
+        points = scene.points.round(4).tolist()
+        assert points[:3] == [[0, 0.9, -0.25], [0, 0.9, 0], [0.25, 0.9, 0.5]]
+        parsed_scene = [metadata.parse_object(scene.name, r) for r in source[f"{room}s"][number]]
+        added = reachable.complete(scene.points[:3], parsed_scene)
+        assert len(added)
+        assert points[3:] == added.round(4).tolist()
         for item, original in zip(scene.objects, source[f"{room}s"][number], strict=True):
             parsed = metadata.parse_object(scene.name, original)
             assert np.allclose(item.box, parsed.box, atol=1e-4)
@@ -121,15 +126,17 @@ def test_bundled_rooms() -> None:
     scenes = ithor.load_scenes()
     names = [f"FloorPlan{number}" for room in ROOM_TYPES for number in SCENE_NUMBERS[room]]
     assert [scene.name for scene in scenes] == names
-    assert sum(len(scene.points) for scene in scenes) == 14_642
+    published = ithor.published_points()
+    assert list(published) == names
+    assert sum(int(published[scene.name].sum()) for scene in scenes) == 14_642
+    assert sum(len(scene.points) for scene in scenes) == 18_344
     assert sum(len(scene.objects) for scene in scenes) == 5_550
     for scene in scenes:
-        # The published default poses lie on the grid, at the agent's height.
+        assert published[scene.name].shape == (len(scene.points),)
+        assert len(np.unique(scene.points, axis=0)) == len(scene.points)
+        # The default poses lie on the grid, at the agent's height.
         assert scene.default_position is not None
-        off = np.abs(scene.points - scene.default_position).max(axis=1).min()
-        assert off < (
-            0.26 if scene.name in ("FloorPlan29", "FloorPlan226", "FloorPlan425") else 1e-3
-        )
+        assert np.abs(scene.points - scene.default_position).max(axis=1).min() < 1e-3
 
 
 def test_flagged_objects_lie_in_the_default_view() -> None:

@@ -13,14 +13,15 @@ from typing import NamedTuple
 import numpy as np
 
 from tdanet_jax import poses
-from tdanet_jax.poses import HORIZONS
-from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene, SceneObject
+from tdanet_jax.poses import HORIZONS, VIEWS
+from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene
 from tdanet_jax.scenes.visibility import rays
-from tdanet_jax.scenes.visibility.geometry import box_frame
+from tdanet_jax.scenes.visibility.geometry import gap_to_box
 from tdanet_jax.scenes.visibility.rules import Rules
-from tdanet_jax.scenes.visibility.solids import THIN, Patches, millimetres, patches_of, solids_of
+from tdanet_jax.scenes.visibility.solids import Patches, millimetres, patches_of, solids_of
 from tdanet_jax.vocabulary import IMAGE_SIZE
 
+PAIRS = 1 << 21  # of a camera and a patch, in a batch
 # Cosine and sine of each horizon; IEEE 754 defines square roots to the last bit.
 TILTS = ((np.float32(1), np.float32(0)), (np.sqrt(np.float32(0.75)), np.float32(0.5)))
 
@@ -70,41 +71,42 @@ def within_reach(scene: Scene, points: np.ndarray, patches: Patches, rules: Rule
             offset = points[:, None] - patches.center[patches.owner == k] / 1000
             gap = (offset[..., 0] ** 2 + offset[..., 2] ** 2).min(axis=1, initial=np.inf)
         else:
-            gap = _gap_to_box(item, points)
+            gap = gap_to_box(item, points)
         result[:, k] = gap <= rules.reach**2
     return result
 
 
-def _gap_to_box(item: SceneObject, points: np.ndarray) -> np.ndarray:
-    """Squared horizontal distance of `points` [P, 3] from an object's box: [P], 0 inside it."""
-    origin, edges = box_frame(item.box, item.corners)
-    flat = edges[np.abs(edges[:, 1]) < THIN][:, [0, 2]]
-    if len(flat) != 2 or np.abs(flat).max(axis=1).min() < THIN:
-        origin, flat = item.box[0], np.diag((item.box[1] - item.box[0])[[0, 2]])
-    gap = np.zeros(len(points))
-    for edge in flat:
-        length = max(np.sqrt((edge * edge).sum()), THIN)
-        along = (points[:, 0] - origin[0]) * edge[0] + (points[:, 2] - origin[2]) * edge[1]
-        beyond = np.maximum(np.maximum(-along / length, along / length - length), 0)
-        gap += beyond * beyond
-    return gap
-
-
 def detect(scene: Scene, rules: Rules, points: np.ndarray | None = None) -> Detections:
-    """The detections at `points` [P, 3] (by default the reachable ones) in all 16 views."""
+    """The detections at `points` [P, 3] (by default the reachable ones) in all 16 views.
+
+    Memory is bounded: many points in a room of many patches are worked on in several batches.
+    """
     points = scene.points if points is None else points
-    patches = patches_of(scene, rules)
+    patches, solids = patches_of(scene, rules), solids_of(scene, rules)
+    batch = max(1, PAIRS // max(len(patches.owner), 1))
+    parts = []
+    for first in range(0, len(points), batch):
+        here = points[first : first + batch]
+        near = within_reach(scene, here, patches, rules)
+        found = _detect(here, near, patches, solids, rules)
+        parts.append(found._replace(state=found.state + np.int32(first * VIEWS)))
+    return Detections(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _detect(
+    points: np.ndarray, near: np.ndarray, patches: Patches, solids: rays.Solids, rules: Rules
+) -> Detections:
+    """The detections at `points` [P, 3], from which the objects `near` [P, O] are within reach."""
     cameras = millimetres(points + np.array([0, CAMERA_ABOVE_AGENT, 0]))
     facing = np.zeros((len(points), len(patches.owner)))
     for axis in range(3):
         facing += patches.normal[:, axis] * (cameras[:, axis, None] - patches.center[:, axis])
     position, patch = np.nonzero(facing > 0)
-    group = position * len(scene.objects) + patches.owner[patch]
-    whole = np.bincount(group, patches.area[patch], len(points) * len(scene.objects))
+    group = position * near.shape[1] + patches.owner[patch]
+    whole = np.bincount(group, patches.area[patch], near.size)
     target = np.rint(patches.center).astype(np.int32)
-    seen = ~rays.cast(cameras[position], target[patch], solids_of(scene, rules))
-    near = within_reach(scene, points, patches, rules).reshape(-1)
-    least = np.where(near, whole * rules.sliver, np.inf)
+    seen = ~rays.cast(cameras[position], target[patch], solids)
+    least = np.where(near.reshape(-1) & (whole > 0), whole * rules.sliver, np.inf)
     return _boxes_in_view(cameras, patches, position[seen], patch[seen], group[seen], least)
 
 

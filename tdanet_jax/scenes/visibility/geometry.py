@@ -10,18 +10,48 @@ import numpy as np
 
 from tdanet_jax import poses
 from tdanet_jax.poses import GRID_SIZE, HORIZONS, ROTATIONS, STEPS
+from tdanet_jax.scenes.scene import SceneObject
+
+THIN = 1e-3  # metres; a box that is thinner than this is taken to be this thick
 
 
 def box_frame(box: np.ndarray, corners: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """The oriented box of an object, or its axis-aligned one: a corner [3] and edges [3, 3] (rows).
 
+    Pictures and rugs may be flat: an edge without a length gets one of a millimetre, perpendicular
+    to the others.
+
     Args:
       box: [2, 3] axis-aligned box.
       corners: [8, 3] of the oriented box, if known: around the bottom face, then around the top.
     """
-    if corners is None:
-        return box[0], np.diag(box[1] - box[0])
-    return corners[0], corners[[1, 4, 3]] - corners[0]
+    origin = box[0] if corners is None else corners[0]
+    edges = np.diag(box[1] - box[0]) if corners is None else corners[[1, 4, 3]] - origin
+    lengths = np.sqrt((edges * edges).sum(axis=1))
+    known = [edge / length for edge, length in zip(edges, lengths, strict=True) if length >= THIN]
+    for axis in np.flatnonzero(lengths < THIN):
+        # The part of each world axis that is perpendicular to the edges with a direction.
+        rest = np.eye(3) - sum((np.outer(edge, edge) for edge in known), np.zeros((3, 3)))
+        direction = rest[np.argmax(np.abs(rest).sum(axis=1))]
+        known.append(direction / np.sqrt((direction * direction).sum()))
+        origin, edges[axis] = origin - known[-1] * THIN / 2, known[-1] * THIN
+    return origin, edges
+
+
+def gap_to_box(item: SceneObject, points: np.ndarray) -> np.ndarray:
+    """Squared horizontal distance of `points` [P, 3] from an object's box: [P], 0 inside it."""
+    origin, edges = box_frame(item.box, item.corners)
+    level = np.argsort(np.abs(edges[:, 1]), kind="stable")[:2]
+    if np.abs(edges[level, 1]).max() >= THIN:
+        origin, edges = box_frame(item.box, None)
+        level = np.array([0, 2])
+    gap = np.zeros(len(points))
+    for edge in edges[level][:, [0, 2]]:
+        length = np.sqrt((edge * edge).sum())
+        along = (points[:, 0] - origin[0]) * edge[0] + (points[:, 2] - origin[2]) * edge[1]
+        beyond = np.maximum(np.maximum(-along / length, along / length - length), 0)
+        gap += beyond * beyond
+    return gap
 
 
 def next_positions(points: np.ndarray) -> np.ndarray:

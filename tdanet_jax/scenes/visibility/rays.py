@@ -1,8 +1,8 @@
 """Exact ray casting: does a box lie between a camera and a point?
 
-Lengths are whole millimetres in 32-bit integers, and fractions are compared by cross-multiplication
-without a product that reaches 2^31. Nothing is rounded, so every machine, compiler and version
-gives the same answer.
+Lengths are whole millimetres (in rooms over 30 m, a multiple of that) in 32-bit integers, and
+fractions are compared by cross-multiplication without a product that reaches 2^31. Nothing is
+rounded, so every machine, compiler and version gives the same answer.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 RAYS = 1 << 16  # rays in a batch: one shape, so one compilation
-MOST_SOLIDS = 256  # in one room
+SOLIDS = 256  # solids in a batch of a room's
 TURN_BITS = 14  # rotations of oriented boxes are multiples of 2^-14
-FARTHEST = 15_000  # millimetres; larger coordinate differences could overflow
+FARTHEST = 30_000  # units of length; larger coordinate differences could overflow
 
 OPEN, CLOSED = 0, 1
 
@@ -27,7 +27,7 @@ OPEN, CLOSED = 0, 1
 class Solids:
     """K occluding boxes: first those aligned with the world's axes, then the oriented ones.
 
-    Millimetres, int32. An oriented box is given in its own frame, around `origin`.
+    Units of length, int32. An oriented box is given in its own frame, around `origin`.
     """
 
     lo: np.ndarray  # [K, 3]
@@ -36,6 +36,7 @@ class Solids:
     origin: np.ndarray  # [K, 3]
     turn: np.ndarray  # [K, 3, 3], rows are the axes of the box times 2^14
     aligned: int  # how many of the K are aligned with the world's axes
+    unit: int = 1  # millimetres in a unit of length
 
 
 # One array [N] per axis: XLA does not vectorise these loops over an axis of length three.
@@ -71,7 +72,7 @@ def blocked_by_box(
 
 
 def _turned(matrix: jax.Array, point: Vectors, origin: jax.Array) -> Vectors:
-    """`point` in the frame of `matrix` [3, 3] (times 2^14) around `origin`, in millimetres."""
+    """`point` in the frame of `matrix` [3, 3] (times 2^14) around `origin`."""
     x, y, z = (point[a] - origin[a] for a in range(3))
     half = 1 << (TURN_BITS - 1)
     a, b, c = ((m[0] * x + m[1] * y + m[2] * z + half) >> TURN_BITS for m in matrix)
@@ -106,8 +107,11 @@ def cast(camera: np.ndarray, point: np.ndarray, solids: Solids) -> np.ndarray:
     count = len(solids.lo)
 
     def padded(array: np.ndarray) -> np.ndarray:
-        rest = np.zeros((MOST_SOLIDS - count, *array.shape[1:]), np.int32)
+        rest = np.zeros((SOLIDS - count % SOLIDS, *array.shape[1:]), np.int32)
         return np.concatenate([array, rest])
+
+    def in_units(lengths: np.ndarray) -> np.ndarray:
+        return lengths if solids.unit == 1 else np.rint(lengths / solids.unit).astype(np.int32)
 
     boxes = [padded(a) for a in (solids.lo, solids.hi, solids.kind, solids.origin, solids.turn)]
     blocked = np.empty(len(point), bool)
@@ -115,8 +119,8 @@ def cast(camera: np.ndarray, point: np.ndarray, solids: Solids) -> np.ndarray:
         for start in range(0, len(point), RAYS):
             stop = min(start + RAYS, len(point))
             block = np.zeros((2, 3, RAYS), np.int32)
-            block[0, :, : stop - start] = camera[start:stop].T
-            block[1, :, : stop - start] = point[start:stop].T
+            block[0, :, : stop - start] = in_units(camera[start:stop]).T
+            block[1, :, : stop - start] = in_units(point[start:stop]).T
             result = _compiled()(block[0], block[1], *boxes, solids.aligned, count)
             blocked[start:stop] = np.asarray(result)[: stop - start]
     return blocked

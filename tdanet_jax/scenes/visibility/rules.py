@@ -34,9 +34,14 @@ class Rules:
     patch: float = 0.1
 
     # Fronts: parts of furniture, of which only upright faces towards the room are seen: the one
-    # with the nearest reachable point in front of it, and any whose nearest is hardly farther.
+    # with the nearest reachable point in front of it, and any whose nearest is at most a step of
+    # the grid farther.
     fronts: frozenset[str] = _names("Cabinet Drawer Shelf StoveKnob")
-    nearly: float = 0.1
+    nearly: float = 0.25
+
+    # Knobs: fronts that stand out. Whether they are visible is decided on the front, but their
+    # image box is that of all faces but the bottom and the back.
+    knobs: frozenset[str] = _names("StoveKnob")
 
     # Carved: L- and U-shaped objects, without the places this close to where an agent can stand.
     carved: frozenset[str] = _names("CounterTop")

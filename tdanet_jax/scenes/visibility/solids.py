@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdanet_jax.scenes.scene import Scene, SceneError, SceneObject
-from tdanet_jax.scenes.visibility.geometry import box_frame
-from tdanet_jax.scenes.visibility.rays import CLOSED, FARTHEST, MOST_SOLIDS, OPEN, TURN_BITS, Solids
+from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.scenes.visibility.geometry import THIN, box_frame
+from tdanet_jax.scenes.visibility.rays import CLOSED, FARTHEST, OPEN, TURN_BITS, Solids
 from tdanet_jax.scenes.visibility.rules import Rules
 
-THIN = 1e-3  # metres; an edge shorter than this has no direction
+MOST_PATCHES = 64  # along an edge
 CELL = 0.25  # metres, cell of the floor plan in which voids are found
 BELOW, ABOVE = 1.0, 3.0  # metres that walls extend below and above the agent's y
 
@@ -24,7 +24,7 @@ class Patches:
     center: np.ndarray  # [Q, 3] float64 millimetres
     corner: np.ndarray  # [Q, 4, 3] float64 millimetres
     normal: np.ndarray  # [Q, 3] float64, outward, not normalised
-    area: np.ndarray  # [Q] int64 square millimetres
+    area: np.ndarray  # [Q] int64 square millimetres that count for the visible flag
 
 
 def millimetres(lengths: np.ndarray) -> np.ndarray:
@@ -58,16 +58,21 @@ def patches_of(scene: Scene, rules: Rules) -> Patches:
         origin, edges = box_frame(item.box, item.corners)
         lengths = np.sqrt((edges * edges).sum(axis=1))
         fine, coarse = np.minimum(lengths, 1.0), np.maximum(lengths - 1.0, 0.0)
-        counts = np.maximum(np.ceil((fine + coarse / 3) / rules.patch), 2).astype(int)
-        faces = [(axis, side) for axis in range(3) for side in (0, 1)]
+        counts = np.clip(np.ceil((fine + coarse / 3) / rules.patch), 2, MOST_PATCHES).astype(int)
+        faces = fronts = [(axis, side) for axis in range(3) for side in (0, 1)]
         if item.object_class in rules.fronts:
-            faces = fronts_of(item, scene.points, rules.nearly)
+            faces = fronts = fronts_of(item, scene.points, rules.nearly)
+        if item.object_class in rules.knobs:
+            hidden = {(1, 0), *((axis, 1 - side) for axis, side in fronts)} - set(fronts)
+            faces = [(axis, side) for axis in range(3) for side in (0, 1)]
+            faces = [face for face in faces if face not in hidden]
         for axis, side in faces:
             u, v = (axis + 1) % 3, (axis + 2) % 3
             grid = _unit_grid(counts[u], counts[v])
             corner = origin + side * edges[axis]
             corner = corner + grid[..., :1] * edges[u] + grid[..., 1:] * edges[v]
-            area = np.rint(lengths[u] * lengths[v] / len(grid) * 1e6)
+            area = max(np.rint(lengths[u] * lengths[v] / len(grid) * 1e6), 1)
+            area *= (axis, side) in fronts
             if item.object_class in rules.carved:
                 corner = corner[~near_any(corner.mean(axis=1), scene.points, rules.standing)]
             normal = np.broadcast_to(edges[axis] * (2 * side - 1), (len(corner), 3))
@@ -97,11 +102,7 @@ def _unit_grid(m: int, n: int) -> np.ndarray:
 
 
 def solids_of(scene: Scene, rules: Rules) -> Solids:
-    """The occluding boxes of a room.
-
-    Raises:
-      SceneError: the room is too large, or has too many, for exact 32-bit ray casting.
-    """
+    """The occluding boxes of a room."""
     aligned = [(box, OPEN) for box in void_boxes(scene, rules)]
     turned = []
     for item in scene.objects:
@@ -115,34 +116,36 @@ def solids_of(scene: Scene, rules: Rules) -> Solids:
             box = item.box.copy()
             box[0, 1] = max(box[0, 1], box[1, 1] - rules.thickness)
             aligned.append((box, kind))
-        elif np.count_nonzero(np.abs(edges) > THIN) <= 3 or lengths.min() < THIN:
+        elif np.sort(np.abs(edges))[:, 1].max() <= THIN:  # along the world's axes
             rim = inset * (item.box[1] - item.box[0])
             aligned.append((item.box + np.stack([rim, -rim]), kind))
         else:
             turned.append((origin + edges.sum(axis=0) / 2, edges, lengths, inset, kind))
     boxes = [box for box, _ in aligned]
     boxes += [np.stack([-lengths, lengths]) * (0.5 - inset) for _, _, lengths, inset, _ in turned]
-    corners = millimetres(np.reshape(boxes, (-1, 2, 3)))
-    _check_size(scene, len(boxes))
+    unit = unit_of(scene)
+    corners = millimetres(np.reshape(boxes, (-1, 2, 3)) / unit)
     plain = len(aligned)
     turns = [np.eye(3)] * plain + [edges / lengths[:, None] for _, edges, lengths, _, _ in turned]
     return Solids(
         lo=corners[:, 0],
         hi=corners[:, 1],
         kind=np.array([kind for _, kind in aligned] + [t[4] for t in turned], np.int32),
-        origin=millimetres(np.reshape([np.zeros(3)] * plain + [t[0] for t in turned], (-1, 3))),
+        origin=millimetres(
+            np.reshape([np.zeros(3)] * plain + [t[0] for t in turned], (-1, 3)) / unit
+        ),
         turn=np.rint(np.reshape(turns, (-1, 3, 3)) * (1 << TURN_BITS)).astype(np.int32),
         aligned=plain,
+        unit=unit,
     )
 
 
-def _check_size(scene: Scene, solids: int) -> None:
+def unit_of(scene: Scene) -> int:
+    """The unit of length, in millimetres, in which rays through a room of this size are exact."""
     places = np.concatenate([scene.points, *(item.box for item in scene.objects)])
+    places = places[np.isfinite(places).all(axis=1)]
     extent = 1000 * np.linalg.norm(places.max(axis=0) - places.min(axis=0))
-    if extent > FARTHEST:
-        raise SceneError(f"{scene.name}: {extent / 1000:.1f} m across, {FARTHEST / 1000} m allowed")
-    if solids > MOST_SOLIDS:
-        raise SceneError(f"{scene.name}: {solids} occluding objects, {MOST_SOLIDS} allowed")
+    return max(1, int(np.ceil(extent / FARTHEST)))
 
 
 def void_boxes(scene: Scene, rules: Rules) -> list[np.ndarray]:
@@ -158,13 +161,15 @@ def void_boxes(scene: Scene, rules: Rules) -> list[np.ndarray]:
     low = np.minimum(boxes[:, 0].min(axis=0, initial=np.inf), ground.min(axis=0))
     high = np.maximum(boxes[:, 1].max(axis=0, initial=-np.inf), ground.max(axis=0))
     counts = np.maximum(np.ceil((high - low) / CELL), 1).astype(int)
-    cells = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1)
-    center = low + (cells.reshape(-1, 1, 2) + 0.5) * CELL
-    gap = np.maximum(np.maximum(boxes[:, 0] - center, center - boxes[:, 1]), 0)
-    near_object = ((gap * gap).sum(axis=-1) < rules.void**2).any(axis=1)
-    offset = ground - center
-    near_point = ((offset * offset).sum(axis=-1) < rules.void**2).any(axis=1)
-    void = ~(near_object | near_point).reshape(counts)
+    void = np.ones(counts, bool)
+    for near in np.concatenate([boxes, np.stack([ground, ground], axis=1)]):
+        first = np.maximum(((near[0] - rules.void - low) / CELL).astype(int), 0)
+        stop = np.minimum(((near[1] + rules.void - low) / CELL).astype(int) + 1, counts)
+        center = [low[a] + (np.arange(first[a], stop[a]) + 0.5) * CELL for a in (0, 1)]
+        x, z = (np.maximum(np.maximum(near[0, a] - c, c - near[1, a]), 0)
+                for a, c in enumerate(center))  # fmt: skip
+        free = x[:, None] ** 2 + z**2 >= rules.void**2
+        void[first[0] : stop[0], first[1] : stop[1]] &= free
     bottom, top = scene.points[:, 1].min() - BELOW, scene.points[:, 1].max() + ABOVE
     return [
         np.array(

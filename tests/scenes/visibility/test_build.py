@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from tdanet_jax.scenes import ithor
 from tdanet_jax.scenes.checks import agreement, dense_rays
 from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.scenes.visibility import build
 from tdanet_jax.scenes.visibility.build import detect
 from tdanet_jax.scenes.visibility.rules import RULES, Rules
 from tdanet_jax.scenes.visibility.solids import fronts_of, patches_of, solids_of, void_boxes
@@ -233,3 +234,101 @@ def test_agreement_with_the_published_flags() -> None:
     for rooms, least in ((train, 0.95), (test, 0.93)):
         total = sum(agreement.by_class(rooms, RULES).values(), agreement.Confusion())
         assert total.f1 > least
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(
+    "flat", [(0,), (1,), (2,), (0, 1), (1, 2), (0, 2), (0, 1, 2)], ids=lambda axes: f"flat{axes}"
+)
+def test_flat_things_are_seen_like_thin_ones(flat: tuple[int, ...], turned: bool) -> None:
+    def seen_with(thickness: float) -> dict[str, tuple[np.ndarray, bool]]:
+        size = np.array([0.5, 0.4, 0.3])
+        size[list(flat)] = thickness
+        middle, half = np.array([0.2, toy.CAMERA - 0.1, 1.2]), size / 2
+        picture = toy.thing(
+            "Painting", (middle[0], middle[1], middle[2]), (size[0], size[1], size[2])
+        )
+        if turned:  # by 30 degrees about its upright axis
+            signs = [(x, y, z) for y in (-1, 1) for x, z in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+            x, y, z = (half * np.array(signs)).T
+            cosine, sine = np.sqrt(0.75), 0.5
+            corners = middle + np.stack([cosine * x + sine * z, y, cosine * z - sine * x], axis=1)
+            box = np.stack([corners.min(axis=0), corners.max(axis=0)])
+            picture = dataclasses.replace(picture, box=box, corners=corners)
+        return seen(toy.room(toy.line(1), picture), 0, 0)
+
+    found, thin = seen_with(0.0), seen_with(0.001)
+    assert found["Painting"][1]
+    assert thin["Painting"][1]
+    assert np.abs(found["Painting"][0].astype(int) - thin["Painting"][0]).max() <= 4
+
+
+def test_a_flat_thing_hides_what_is_behind_it() -> None:
+    apple = toy.thing("Apple", (0.0, toy.CAMERA, 1.2))
+    picture = toy.thing("Painting", (0.0, toy.CAMERA, 0.8), (1.0, 1.0, 0.0))
+    assert "Apple" not in seen(toy.room(toy.line(1), apple, picture), 0, 0)
+
+
+def test_a_knob_is_flagged_by_its_front_and_boxed_by_all_that_stands_out() -> None:
+    rules = dataclasses.replace(BARE, nearly=0.0)
+    knob = toy.thing("StoveKnob", (0.0, toy.CAMERA, 1.0), (0.04, 0.04, 0.04))
+    # Its front looks along -z to the first point, 0.98 m away; the second is 1 m to its right.
+    spots = toy.points((0.0, 0.0), (1.01, 1.0))
+    assert fronts_of(knob, spots, rules.nearly) == [(2, 0)]
+    box, visible = seen(toy.room(spots, knob), 0, 0, rules=rules)["StoveKnob"]
+    half = MIDDLE * 0.02 / 0.98
+    assert visible
+    assert np.allclose(box, [MIDDLE - half] * 2 + [MIDDLE + half] * 2, atol=4)
+    # From its right it has a box, its right face's, but is not visible.
+    box, visible = seen(toy.room(spots, knob), 1, 6, rules=rules)["StoveKnob"]
+    half = MIDDLE * 0.02 / 0.99
+    assert not visible
+    assert np.allclose(box, [MIDDLE - half] * 2 + [MIDDLE + half] * 2, atol=4)
+    # From behind it has none, and from its right a drawer has none.
+    behind = toy.points((0.0, 0.0), (0.0, 2.1))
+    assert seen(toy.room(behind, knob), 0, 0, rules=rules)
+    assert not seen(toy.room(behind, knob), 1, 4, rules=rules)
+    drawer = dataclasses.replace(knob, object_class="Drawer")
+    assert not seen(toy.room(spots, drawer), 1, 6, rules=rules)
+
+
+@pytest.mark.parametrize("length", [20.0, 70.0])
+def test_rooms_of_any_size(length: float) -> None:
+    # Two walls with a gap between them half-way, and an apple behind the gap, or behind a wall.
+    def hall(x: float) -> Scene:
+        apple = toy.thing("Apple", (x, toy.CAMERA, length), (0.4, 0.4, 0.4))
+        walls = [
+            toy.thing("Sofa", (side * (0.3 + length / 2), toy.CAMERA, length / 2),
+                      (length, 4.0, 0.2), number)
+            for number, side in enumerate((-1, 1))
+        ]  # fmt: skip
+        return toy.room(toy.line(1), apple, *walls)
+
+    solid = dataclasses.replace(BARE, inset=0.0)
+    box, visible = seen(hall(0.0), 0, 0, rules=solid)["Apple"]
+    assert not visible
+    half = MIDDLE * 0.2 / (length - 0.2)
+    assert np.allclose(box, [MIDDLE - half] * 2 + [MIDDLE + half] * 2, atol=4)
+    assert "Apple" not in seen(hall(3.0), 0, 0, rules=solid)
+
+
+def test_rooms_with_any_number_of_solids() -> None:
+    # 300 books in a row, each of which hides an apple from a point of its own.
+    places = [0.1 * i for i in range(300)]
+    books = [toy.thing("Book", (x, toy.CAMERA, 0.8), (0.09, 0.3, 0.05), i)
+             for i, x in enumerate(places)]  # fmt: skip
+    for x in (places[0], places[-1]):
+        apple = toy.thing("Apple", (x, toy.CAMERA, 1.2), (0.05, 0.05, 0.05))
+        spots = toy.points((x, 0.0))
+        assert "Apple" in seen(toy.room(spots, apple, *books[1:-1]), 0, 0)
+        assert "Apple" not in seen(toy.room(spots, apple, *books), 0, 0)
+
+
+def test_batches_of_positions_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = next(scene for scene in ithor.load_scenes() if scene.name == "FloorPlan402")
+    scene = dataclasses.replace(scene, points=scene.points[:20])
+    whole = detect(scene, RULES)
+    monkeypatch.setattr(build, "PAIRS", 7 * len(patches_of(scene, RULES).owner))
+    for field, other in zip(whole, detect(scene, RULES), strict=True):
+        assert field.dtype == other.dtype
+        assert np.array_equal(field, other)
