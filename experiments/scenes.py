@@ -73,7 +73,7 @@ class Verify:
         check_positive(rooms=self.rooms, views=self.views, worst=self.worst)
         from tdanet_jax.env.reward import PARENT_CANDIDATES
         from tdanet_jax.scenes import ithor, load_tables
-        from tdanet_jax.scenes.checks import agreement, dense_rays, survey
+        from tdanet_jax.scenes.checks import agreement, dense_rays, grid, survey
         from tdanet_jax.scenes.visibility.rules import RULES
 
         start = time.monotonic()
@@ -86,6 +86,7 @@ class Verify:
             "test": [room for room in rooms if room.name not in train],
         }
         groups = {"22 targets": ALL_TARGETS, "possible parents": PARENT_CANDIDATES}
+        console.print(*grid.summary(rooms, ithor.published_points(), train), sep="\n")
         console.print(*agreement.table(parts, groups, RULES, self.worst), sep="\n")
         console.print(dense_rays.summary(rooms, RULES, self.rooms, self.views))
         with reporter("rooms") as report:
