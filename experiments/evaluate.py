@@ -95,8 +95,8 @@ def play(command: Command, config: TrainConfig, folder: Path) -> None:
     Args:
       config: rooms, classes and words of a policy that needs no checkpoint.
     """
-    from tdanet_jax.evaluation.evaluate import evaluate
     from tdanet_jax.training import devices
+    from tdanet_jax.workflows.evaluate import evaluate
 
     devices.keep_compiled()
     runs = command.checkpoint

@@ -33,11 +33,11 @@ from experiments.console import (
 from experiments.running import Command as TrainingCommand
 from experiments.running import how_to_continue, parse_command, stoppable
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
-from tdanet_jax.evaluation import sweep, sweep_report
-from tdanet_jax.evaluation.sweep import FinishedRun
-from tdanet_jax.evaluation.sweep_report import Cost
 from tdanet_jax.io import files
 from tdanet_jax.splits import file_name
+from tdanet_jax.workflows import sweep, sweep_report
+from tdanet_jax.workflows.sweep import FinishedRun
+from tdanet_jax.workflows.sweep_report import Cost
 
 #: Batches whose inference time is reported.
 BATCHES = (1, 1024)
@@ -126,7 +126,7 @@ def train_all(command: Command, training: TrainingCommand, configs: Sequence[Tra
     from tdanet_jax.models.factory import make_model
     from tdanet_jax.task import resolve
     from tdanet_jax.training import devices
-    from tdanet_jax.training.train import train, train_together
+    from tdanet_jax.workflows.train import train, train_together
 
     devices.connect(training.devices)
     devices.keep_compiled()

@@ -46,7 +46,7 @@ def check(command: Command) -> TrainConfig:
                 "--resume continues a run as it began: it takes a new budget (--steps, --episodes, "
                 "--minutes), --devices and --tensorboard alone"
             )
-        from tdanet_jax.training.train import resumed
+        from tdanet_jax.workflows.train import resumed
 
         config = resumed(command.resume, config)
     else:
@@ -68,7 +68,7 @@ def default_folder(config: TrainConfig) -> Path:
 def run(command: Command, config: TrainConfig, folder: Path) -> None:
     """Trains to the end of the budget, then evaluates and reports."""
     with stoppable(lambda: how_to_continue(folder, config)) as reports:
-        from tdanet_jax.training.train import train
+        from tdanet_jax.workflows.train import train
 
         results = train(
             config,

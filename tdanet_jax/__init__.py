@@ -14,10 +14,10 @@ from tdanet_jax import _moved
 if TYPE_CHECKING:
     from tdanet_jax.agent import Agent, Decision, Detection, load
     from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
-    from tdanet_jax.evaluation.evaluate import evaluate
     from tdanet_jax.task import make
     from tdanet_jax.training.callbacks import Callbacks
-    from tdanet_jax.training.train import train
+    from tdanet_jax.workflows.evaluate import evaluate
+    from tdanet_jax.workflows.train import train
 
 __version__ = "0.2.0"
 
@@ -30,10 +30,10 @@ _PUBLIC = {
     "LearnerConfig": "config",
     "NetworkConfig": "config",
     "TrainConfig": "config",
-    "evaluate": "evaluation.evaluate",
+    "evaluate": "workflows.evaluate",
     "load": "agent",
     "make": "task",
-    "train": "training.train",
+    "train": "workflows.train",
 }
 
 __all__ = [

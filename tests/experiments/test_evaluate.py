@@ -15,12 +15,12 @@ from experiments import evaluate
 from tdanet_jax import config as configs
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.evaluation import report, saved_networks
-from tdanet_jax.evaluation.evaluate import short_names
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
 from tdanet_jax.io.files import check_empty
 from tdanet_jax.task import make_task
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
+from tdanet_jax.workflows.evaluate import short_names
 from tests.agent.test_agent import OLD_RUN
 from tests.evaluation.test_comparison import result as made_up
 from tests.support import command, samples

@@ -27,10 +27,10 @@ from experiments import train_zero_shot
 from tdanet_jax.evaluation import rollout
 from tdanet_jax.io import assets, files
 from tdanet_jax.scenes import cache
-from tdanet_jax.training import train as training
 from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.training.journal import METRICS_FILE, Journal, read_metrics, tensorboard_sink
 from tdanet_jax.training.run import Run
+from tdanet_jax.workflows import train as training
 from tests.support import command
 from tests.training.test_checkpoint import flip, halve
 

@@ -9,9 +9,10 @@ import pytest
 
 from tdanet_jax import config as configs
 from tdanet_jax.config import LearnerConfig, TrainConfig
-from tdanet_jax.evaluation import saved_networks, sweep
+from tdanet_jax.evaluation import saved_networks
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
+from tdanet_jax.workflows import sweep
 from tests.evaluation.test_comparison import result
 
 BASE = TrainConfig(steps=1000)

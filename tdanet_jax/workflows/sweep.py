@@ -187,7 +187,7 @@ def _fingerprint(run: FinishedRun) -> str:
 
 def untrained(runs: Sequence[FinishedRun], seed: int) -> list[Result]:
     """Results of random actions and of the shortest path on the splits of the runs."""
-    from tdanet_jax.evaluation.evaluate import UNTRAINED, evaluate
+    from tdanet_jax.workflows.evaluate import UNTRAINED, evaluate
 
     splits = {run.results["split"]: run.config for run in runs}.values()
     return [evaluate(policy=n, config=config, seed=seed) for config in splits for n in UNTRAINED]

@@ -9,9 +9,9 @@ from typing import Any
 
 from tdanet_jax.evaluation import comparison, paper
 from tdanet_jax.evaluation.comparison import Curve, Result, Spread
-from tdanet_jax.evaluation.sweep import FinishedRun, evaluated_history, labels
 from tdanet_jax.registry import MODELS
 from tdanet_jax.splits import UNSEEN
+from tdanet_jax.workflows.sweep import FinishedRun, evaluated_history, labels
 
 REPORT_VERSION = 1
 #: The splits of the paper's tables.

@@ -6,12 +6,12 @@ import json
 import pytest
 
 from tdanet_jax.config import NetworkConfig
-from tdanet_jax.evaluation import sweep, sweep_report
 from tdanet_jax.evaluation.comparison import curve
-from tdanet_jax.evaluation.sweep_report import Cost, Report
 from tdanet_jax.registry import MODELS
+from tdanet_jax.workflows import sweep, sweep_report
+from tdanet_jax.workflows.sweep_report import Cost, Report
 from tests.evaluation.test_comparison import result
-from tests.evaluation.test_sweep import BASE, evaluate_history, keep_history, made
+from tests.workflows.test_sweep import BASE, evaluate_history, keep_history, made
 
 
 @pytest.fixture
