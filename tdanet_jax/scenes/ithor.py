@@ -110,13 +110,15 @@ def _room_arrays(scene: Scene, added: np.ndarray) -> dict[str, Any]:
     corners = [item.corners for item in items if item.corners is not None]
     row = {item.object_id: i for i, item in enumerate(items)}
     parents = [sorted(row[p] for p in item.parents if p in row) for item in items]
+    points = np.concatenate([scene.points, added])
+    order = np.lexsort((points[:, 2], points[:, 0]))
     return {
         "name": scene.name.encode(),
         "room_type": np.int8(scene.room_type),
         "default_position": _whole(scene.default_position),
         "default_rotation": np.int16(scene.default_rotation or 0),
-        "point": _whole(np.concatenate([scene.points, added])),
-        "point_published": np.repeat([True, False], [len(scene.points), len(added)]),
+        "point": _whole(points[order]),
+        "point_published": order < len(scene.points),
         "object_id": np.array([item.object_id.encode() for item in items]),
         "object_class": np.array([item.object_class.encode() for item in items]),
         "object_box": _whole([item.box for item in items]),
