@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import tyro
 
 from experiments.console import (
@@ -32,7 +33,7 @@ from experiments.console import (
 )
 from tdanet_jax.io import files
 from tdanet_jax.poses import GRID_SIZE, VIEWS
-from tdanet_jax.splits import make_split
+from tdanet_jax.splits import UNSEEN, make_split
 from tdanet_jax.vocabulary import ALL_TARGETS, FIELD_OF_VIEW, IMAGE_SIZE, ROOM_TYPES
 
 if TYPE_CHECKING:
@@ -270,9 +271,46 @@ class Export:
             vectors = words.load_word_vectors(self.word_vectors, tables.classes).table(
                 tables.classes, None
             )
+        starts = test_starts(rooms, tables)
         with reporter("export") as report:
-            exporter.write_folder(tables, self.out, report, parents, vectors, self.features)
+            written = exporter.write_folder(
+                tables, self.out, report, parents, vectors, self.features
+            )
+        if written.left_out:
+            listed = ", ".join(f"{name} ({count:,})" for name, count in written.left_out.items())
+            console.print(
+                f"Left out {sum(written.left_out.values()):,} states that are not connected to the "
+                f"largest part of their room: {listed}. Of {len(starts):,} test episodes in the "
+                f"exported rooms, {sum(not written.kept[s] for s in starts):,} start there: play "
+                "none of them in the export"
+            )
         console.print(f"{self.out}")
+
+
+def test_starts(rooms: dataset.Rooms, tables: SceneTables) -> list[int]:
+    """The start states of the test episodes in `tables`, which are some of the rooms.
+
+    Of bundled rooms, those of the published splits; of imported data, the published ones.
+    """
+    from tdanet_jax.evaluation import episodes
+
+    whole, number = rooms.tables, {name: i for i, name in enumerate(tables.scenes)}
+    if rooms.extras is not None:
+        return [
+            tables.nearest_state(number[e.scene], e.x, e.z, e.rotation, e.horizon)
+            for e in rooms.extras.episodes
+            if e.part == "test" and e.scene in number
+        ]
+    lists = [episodes.load(whole, make_split(name)) for name in UNSEEN]
+    listed = {
+        (int(pose), int(target))
+        for groups in lists
+        for group in groups.values()
+        for pose, target in zip(group.pose, group.target, strict=True)
+    }
+    kept = np.isin(whole.state_scene, [whole.scenes.index(name) for name in tables.scenes])
+    state = np.cumsum(kept) - 1
+    return [int(state[pose]) for pose, _ in sorted(listed) if kept[pose]]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -52,8 +52,10 @@ def test_other_names_have_no_kind(name: str) -> None:
 
 
 def test_names_are_sorted_by_their_numbers() -> None:
-    names = ["7", "Attic", "FloorPlan2", "FloorPlan2-1", "FloorPlan2-10", "FloorPlan10"]
-    assert sorted(names[::-1], key=room_names.sort_key) == names
+    names = ["FloorPlan10", "FloorPlan2-10", "Attic", "FloorPlan2-1", "7", "FloorPlan2"]
+    assert sorted(names, key=room_names.sort_key) == [
+        "7", "Attic", "FloorPlan2", "FloorPlan2-1", "FloorPlan2-10", "FloorPlan10"
+    ]  # fmt: skip
 
 
 def test_a_table_of_rooms(tmp_path: Path) -> None:

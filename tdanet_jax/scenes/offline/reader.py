@@ -113,6 +113,8 @@ def read_graph(path: Path, grid: Grid) -> tuple[np.ndarray, list[str]]:
     nodes, links = content.get("nodes"), content.get("links", content.get("edges"))
     if not isinstance(nodes, list) or not isinstance(links, list):
         raise FileError(path, "not a node-link graph (no nodes and links)")
+    if content.get("edges", links) != links:
+        raise FileError(path, "links and edges, two names for one list, differ")
     names = [node.get("id") if isinstance(node, Mapping) else None for node in nodes]
     states = {str(name): grid.state(path, name) for name in names}
     order = [states[str(name)] for name in names]

@@ -72,7 +72,9 @@ def test_links_by_name_and_links_called_edges_are_the_same(folder: Path) -> None
 
     change(folder, "graph.json", new_style)
     np.testing.assert_array_equal(read(folder).next_position, before)
-    change(folder, "graph.json", lambda graph: graph.update(edges=graph.pop("links")))
+    change(folder, "graph.json", lambda graph: graph.update(edges=graph["links"]))
+    np.testing.assert_array_equal(read(folder).next_position, before)
+    change(folder, "graph.json", lambda graph: graph.pop("links") and None)
     np.testing.assert_array_equal(read(folder).next_position, before)
 
 
@@ -196,6 +198,7 @@ BAD: list[tuple[str, Any, str]] = [
     ("grid.json", lambda c: c[:2], None),
     ("graph.json", lambda c: [1], "not a node-link graph"),
     ("graph.json", lambda c: c.pop("links") and None, "not a node-link graph"),
+    ("graph.json", lambda c: c.update(edges=c["links"][1:]), "links and edges"),
     ("graph.json", lambda c: c["links"].append({"source": 0, "target": 48}), "target 48 is not"),
     ("graph.json", lambda c: c["links"].append({"source": "9.00|0.00|0|0", "target": 0}),
      "source '9.00|0.00|0|0' is not among the nodes"),

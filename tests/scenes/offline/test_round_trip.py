@@ -19,6 +19,7 @@ from tdanet_jax.io.untrusted import FileError, hdf5
 from tdanet_jax.scenes import SceneTables, dataset, tabulation
 from tdanet_jax.scenes.offline import exporter, features, importer, layout, reader
 from tdanet_jax.scenes.offline.layout import OBJECT_FILE, state_keys
+from tdanet_jax.scenes.scene import SceneError
 from tdanet_jax.splits import make_split
 from tdanet_jax.vocabulary import ALL_TARGETS, TARGETS
 from tests.support import original, toy
@@ -52,7 +53,7 @@ def assert_equal(ours: SceneTables, theirs: SceneTables) -> None:
 
 def test_export_and_import_are_the_identity(some_rooms: SceneTables, tmp_path: Path) -> None:
     rooms = some_rooms.subset(["FloorPlan29", "FloorPlan321", "FloorPlan428"])
-    exporter.write_folder(rooms, tmp_path / "out", silent)
+    rooms = exporter.write_folder(rooms, tmp_path / "out", silent).tables
     back = importer.read_folder(tmp_path / "out", silent).tables
     assert_equal(rooms, back)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(rooms.scenes)
@@ -206,6 +207,25 @@ def test_broken_features_leave_nothing_behind(some_rooms: SceneTables, tmp_path:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out"]
 
 
+def test_the_links_have_the_names_of_older_and_newer_networkx(some_rooms: SceneTables) -> None:
+    room = some_rooms.subset(["FloorPlan428"])
+    graph = exporter.graph(room, state_keys(room.position))
+    assert len(graph["links"]) > room.num_states
+    assert graph["links"] == graph["edges"]
+
+
+@pytest.mark.parametrize("name", ["../../escaped", "/absolute", "a/b", "..", "a\nb"])
+def test_nothing_is_written_outside_of_the_folder(
+    some_rooms: SceneTables, tmp_path: Path, name: str
+) -> None:
+    room = dataclasses.replace(some_rooms.subset(["FloorPlan428"]), scenes=(name,))
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(SceneError, match="room name"):
+        exporter.write_folder(room, tmp_path / "a" / "b" / "out", silent)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_parents_survive_export_and_import(ithor: SceneTables) -> None:
     split = make_split("22/0")
     train = ithor.subset(split.train_scenes)
@@ -276,6 +296,6 @@ def test_folders_without_scenes(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_all_rooms_survive_export_and_import(ithor: SceneTables, tmp_path: Path) -> None:
     """To the last bit: the hash over all fields is the same."""
-    exporter.write_folder(ithor, tmp_path / "out", silent)
+    written = exporter.write_folder(ithor, tmp_path / "out", silent).tables
     back = importer.read_folder(tmp_path / "out", silent).tables
-    assert back.data_version == ithor.data_version
+    assert back.data_version == written.data_version
