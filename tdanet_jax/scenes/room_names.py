@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,6 +65,23 @@ def kind_of(name: str) -> RoomKind | None:
             part = PARTS[0] if trains else PARTS[1]
             return RoomKind(room_type, None if match[0] == name else part)
     return None
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """The kinds of rooms: by a table, otherwise by name, otherwise all the same.
+
+    Attributes:
+      table: from `read_table`.
+      other: the kind of rooms that are not in the table and whose name says nothing.
+    """
+
+    table: Mapping[str, RoomKind] = field(default_factory=dict)
+    other: RoomKind | None = None
+
+    def of(self, name: str) -> RoomKind | None:
+        """The kind of a room, or None if nothing says it."""
+        return self.table.get(name) or kind_of(name) or self.other
 
 
 def sort_key(name: str) -> tuple[tuple[bool, int, str], ...]:

@@ -8,7 +8,7 @@ import pytest
 
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes import room_names
-from tdanet_jax.scenes.room_names import RoomKind
+from tdanet_jax.scenes.room_names import Kinds, RoomKind
 from tdanet_jax.scenes.scene import SceneError
 
 
@@ -49,6 +49,16 @@ def test_names_that_begin_with_an_ithor_room_have_its_kind(name: str, kind: Room
 )  # fmt: skip
 def test_other_names_have_no_kind(name: str) -> None:
     assert room_names.kind_of(name) is None
+
+
+def test_a_table_says_more_than_a_name_and_a_name_more_than_the_rest() -> None:
+    table = {"FloorPlan1-1": RoomKind(2, "test"), "Lab": RoomKind(1, None)}
+    kinds = Kinds(table, RoomKind(3, "train"))
+    assert kinds.of("FloorPlan1-1") == RoomKind(2, "test")
+    assert kinds.of("FloorPlan1-2") == RoomKind(0, "train")
+    assert kinds.of("Lab") == RoomKind(1, None)
+    assert kinds.of("Attic") == RoomKind(3, "train")
+    assert Kinds().of("Attic") is None
 
 
 def test_names_are_sorted_by_their_numbers() -> None:
