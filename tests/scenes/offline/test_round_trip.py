@@ -304,7 +304,7 @@ def test_rooms_of_any_name(tmp_path: Path) -> None:
              "FloorPlan430", "FloorPlan5_physics")  # fmt: skip
     source = copies(tmp_path, *names, "a\nb", "x" * 201)
     (source / "FloorPlan6-1").mkdir()
-    (source / "gcn").mkdir()
+    (source / "thor_glove").mkdir()
     lines: list[str] = []
     back = importer.read_folder(source, lambda share, line: lines.append(line))
     assert back.tables.scenes == (
