@@ -25,7 +25,8 @@ Arguments = TypeVar("Arguments")
 #: Without a terminal, progress is a line at most this often.
 SECONDS_BETWEEN_LINES = 10.0
 
-console = Console(stderr=False, highlight=False, soft_wrap=True)
+#: Without markup: names from files may hold brackets.
+console = Console(stderr=False, highlight=False, soft_wrap=True, markup=False)
 
 
 def fail(message: object) -> NoReturn:

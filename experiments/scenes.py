@@ -15,8 +15,9 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
 from experiments.console import (
@@ -32,11 +33,12 @@ from experiments.console import (
 )
 from tdanet_jax.io import files
 from tdanet_jax.poses import GRID_SIZE, VIEWS
-from tdanet_jax.splits import make_split
+from tdanet_jax.splits import UNSEEN, make_split
 from tdanet_jax.vocabulary import ALL_TARGETS, FIELD_OF_VIEW, IMAGE_SIZE, ROOM_TYPES
 
 if TYPE_CHECKING:
-    from tdanet_jax.scenes import SceneTables, dataset
+    from tdanet_jax.scenes import SceneTables, dataset, room_names
+    from tdanet_jax.scenes.offline import frames
     from tdanet_jax.scenes.scene import Scene
 
 
@@ -159,20 +161,30 @@ class Inspect:
 class Import:
     """Writes a file of rooms for --data, from AI2-THOR metadata or from the original offline data.
 
-    The source is a scene file (JSON, see docs/scenes.md) or, with --from, a folder of FloorPlan*
-    folders, as SAVN, MJOLNIR and SSNet use it (see docs/data.md).
+    The source is a scene file (JSON, see docs/scenes.md) or, with --from, a folder with a folder
+    per room, as SAVN, MJOLNIR and SSNet use it (see docs/data.md).
     """
 
     scenes: tyro.conf.Positional[Path | None] = None
     """Scene file."""
     source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
-    """Folder with the folders FloorPlan*; files next to them (parents, class graph, test episodes)
-    are imported as well. An interrupted import continues where it stopped."""
+    """Folder with the rooms' folders; files next to them (parents, class graph, test episodes) are
+    imported as well. An interrupted import continues where it stopped."""
     out: Path = Path("tables.npz")
     """File to write; it must not exist."""
     features: bool = False
     """Requires --from. Also copies the scenes' resnet18_featuremap.hdf5 into one memory-mapped file
     next to --out, in half precision: 50 kB per state, 12 GB for all rooms."""
+    frame_size: str | None = None
+    """Requires --from. WIDTHxHEIGHT in pixels of the recorded frames, such as 640x480; by default
+    as images.hdf5 or metadata.json have it, otherwise 300x300."""
+    rooms: Path | None = None
+    """Requires --from. Table (CSV) with the columns name, room_type and part, for rooms whose names
+    do not begin with that of an iTHOR room, or that belong elsewhere."""
+    room_type: Literal["kitchen", "living_room", "bedroom", "bathroom"] | None = None
+    """Requires --from. Type of all rooms for which neither the table nor the name says it."""
+    part: Literal["train", "test"] | None = None
+    """Requires --room-type. The part of every split that those rooms belong to."""
 
     def run(self) -> None:
         """Writes the file, and reports what in the rooms cannot be reached."""
@@ -181,16 +193,20 @@ class Import:
         from tdanet_jax.scenes.offline import features, importer
 
         if (self.scenes is None) == (self.source is None):
-            fail("import needs a scene file, or --from a folder of FloorPlan*, and not both")
-        if self.features and self.source is None:
-            fail("--features: needs --from")
+            fail("import needs a scene file, or --from a folder of rooms, and not both")
+        for flag in ("features", "frame_size", "rooms", "room_type"):
+            if getattr(self, flag) and self.source is None:
+                fail(f"--{flag.replace('_', '-')}: needs --from")
+        if self.part is not None and self.room_type is None:
+            fail("--part: needs --room-type")
         check_new_file(self.out)
+        kinds, frame = self._kinds(), self._frame()
         maps, maps_out = None, features.features_path(self.out)
         if self.features and self.source is not None:
             check_new_file(maps_out)
-            maps = features.find_features(self.source)
+            maps = features.find_features(self.source, kinds)
         remove_abandoned(self.out, maps_out)
-        rooms = self._rooms()
+        rooms = self._rooms(kinds, frame)
         console.print(*survey.summary(rooms.tables), sep="\n")
         console.print(*survey.uses(rooms), sep="\n")
         if maps is None:
@@ -203,7 +219,28 @@ class Import:
         for path in (maps_out, self.out) if maps else (self.out,):
             console.print(f"{path}")
 
-    def _rooms(self) -> dataset.Rooms:
+    def _kinds(self) -> room_names.Kinds:
+        """Room type and part of the rooms, as the flags say."""
+        from tdanet_jax.scenes import room_names
+
+        table = room_names.read_table(self.rooms) if self.rooms is not None else {}
+        if self.room_type is None:
+            return room_names.Kinds(table)
+        kind = room_names.RoomKind(ROOM_TYPES.index(self.room_type), self.part)
+        return room_names.Kinds(table, kind)
+
+    def _frame(self) -> frames.Frame | None:
+        """The size of the frames, if --frame-size says it."""
+        from tdanet_jax.scenes.offline import frames
+
+        if self.frame_size is None:
+            return None
+        frame = frames.parse(self.frame_size)
+        if frame is None:
+            fail(f"--frame-size {self.frame_size}: not WIDTHxHEIGHT in pixels, such as 300x300")
+        return frame
+
+    def _rooms(self, kinds: room_names.Kinds, frame: frames.Frame | None) -> dataset.Rooms:
         """The rooms of the source, before anything is written."""
         from tdanet_jax.scenes import dataset
         from tdanet_jax.scenes.offline import importer
@@ -217,12 +254,11 @@ class Import:
         with reporter("import") as report:
 
             def show(share: float, line: str) -> None:
+                console.print(line)  # all of them; on a terminal above the bar
                 if console.is_terminal:
-                    console.print(line)  # above the bar
-                    line = ""
-                report(share, line)
+                    report(share, "")
 
-            return importer.read_folder(self.source, show)
+            return importer.read_folder(self.source, show, kinds, frame)
 
 
 def remove_abandoned(*outs: Path) -> None:
@@ -234,7 +270,10 @@ def remove_abandoned(*outs: Path) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Writes rooms as a folder of FloorPlan* folders, which SAVN, MJOLNIR and SSNet read."""
+    """Writes rooms as a folder with a folder per room, which SAVN, MJOLNIR and SSNet read.
+
+    Of each room, the largest part in which every state leads to every other is written.
+    """
 
     out: Path
     """Folder to write; it must not exist."""
@@ -271,9 +310,46 @@ class Export:
             vectors = words.load_word_vectors(self.word_vectors, tables.classes).table(
                 tables.classes, None
             )
+        starts = test_starts(rooms, tables)
         with reporter("export") as report:
-            exporter.write_folder(tables, self.out, report, parents, vectors, self.features)
+            written = exporter.write_folder(
+                tables, self.out, report, parents, vectors, self.features
+            )
+        if written.left_out:
+            listed = ", ".join(f"{name} ({count:,})" for name, count in written.left_out.items())
+            console.print(
+                f"Left out {sum(written.left_out.values()):,} states that are not connected to the "
+                f"largest part of their room: {listed}. Of {len(starts):,} test episodes in the "
+                f"exported rooms, {sum(not written.kept[s] for s in starts):,} start there: play "
+                "none of them in the export"
+            )
         console.print(f"{self.out}")
+
+
+def test_starts(rooms: dataset.Rooms, tables: SceneTables) -> list[int]:
+    """The start states of the test episodes in `tables`, which are some of the rooms.
+
+    Of bundled rooms, those of the published splits; of imported data, the published ones.
+    """
+    from tdanet_jax.evaluation import episodes
+
+    whole, number = rooms.tables, {name: i for i, name in enumerate(tables.scenes)}
+    if rooms.extras is not None:
+        return [
+            tables.nearest_state(number[e.scene], e.x, e.z, e.rotation, e.horizon)
+            for e in rooms.extras.episodes
+            if e.part == "test" and e.scene in number
+        ]
+    lists = [episodes.load(whole, make_split(name)) for name in UNSEEN]
+    listed = {
+        (int(pose), int(target))
+        for groups in lists
+        for group in groups.values()
+        for pose, target in zip(group.pose, group.target, strict=True)
+    }
+    kept = np.isin(whole.state_scene, [whole.scenes.index(name) for name in tables.scenes])
+    state = np.cumsum(kept) - 1
+    return [int(state[pose]) for pose, _ in sorted(listed) if kept[pose]]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -55,7 +55,7 @@ for _name, _convert in {
 }.items():
     jax.config.update(_name, _convert(os.environ[_name.upper()]))
 
-#: Two rooms of each type. Parts of FloorPlan29, 204 and 229 cannot be reached from the others.
+#: Two rooms of each type. Parts of FloorPlan204 cannot be reached from the others.
 SOME_ROOMS = (
     "FloorPlan7", "FloorPlan29", "FloorPlan204", "FloorPlan229", "FloorPlan303", "FloorPlan321",
     "FloorPlan402", "FloorPlan428",

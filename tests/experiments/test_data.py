@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -83,6 +84,39 @@ def test_the_miniature_trains_and_evaluates(
     seen = [Detection("table top", 0, 0, 1, 1)]
     _, decision = agent.act(agent.start(), seen, target="mug")
     assert decision.probabilities.shape == (6,)
+
+
+def test_rooms_of_any_name_and_frame(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every line is printed, brackets in names included, and the flags are obeyed."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("FloorPlan_Train1_1", "Lab [bold]", "FloorPlan21-1"):
+        original.write_room(tmp_path / "rooms" / name)
+    Path("rooms.csv").write_text("name,room_type,part\nLab [bold],bedroom,test\n")
+    given = ["--from", "rooms", "--rooms", "rooms.csv", "--frame-size", "600x400"]
+    scenes.main(["import", *given, "--out", "some.npz"])
+    said = capsys.readouterr()
+    assert "FloorPlan_Train1_1: left out, --room-type or --rooms must say its type" in said.out
+    assert "Lab [bold]: 3 points" in said.out
+    assert "FloorPlan21-1: 3 points" in said.out
+    assert "import with --frame-size WIDTHxHEIGHT" in said.err
+    scenes.main(["import", *given, "--room-type", "kitchen", "--part", "train", "--out", "all.npz"])
+    rooms = dataset.load_rooms("all.npz")
+    assert rooms.tables.scenes == ("FloorPlan21-1", "FloorPlan_Train1_1", "Lab [bold]")
+    assert rooms.tables.room_type.tolist() == [0, 0, 2]
+    assert rooms.extras is not None
+    assert rooms.extras.parts == {
+        "FloorPlan21-1": "test", "FloorPlan_Train1_1": "train", "Lab [bold]": "test"
+    }  # fmt: skip
+    assert rooms.tables.row_box[:, 2].max() == 200 * 16 / 2
+    assert rooms.tables.row_box[:, 3].max() == 300 * 16 * 3 / 4
+    escaped = dataclasses.replace(rooms.tables, scenes=("FloorPlan21-1", "../../a", "Lab"))
+    dataset.save_rooms(dataset.Rooms(escaped, None), Path("escaped.npz"))
+    before = sorted(tmp_path.rglob("*"))
+    arguments = ["export", "--data", "escaped.npz", "--out", "out"]
+    assert "room name '../../a': is a path" in fails(scenes, arguments, capsys)
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def write_features(place: Path) -> None:
@@ -181,6 +215,13 @@ def test_wrong_arguments_give_one_line_and_write_nothing(
         (scenes, ["import"], "a scene file, or --from a folder"),
         (scenes, ["import", "own.json", "--from", "original"], "not both"),
         (scenes, ["import", "own.json", "--features"], "--features: needs --from"),
+        (scenes, ["import", "own.json", "--frame-size", "3x3"], "--frame-size: needs --from"),
+        (scenes, ["import", "own.json", "--room-type", "kitchen"], "--room-type: needs --from"),
+        (scenes, ["import", "own.json", "--rooms", "rooms.csv"], "--rooms: needs --from"),
+        (scenes, ["import", "--from", "original", "--part", "test"], "--part: needs --room-type"),
+        (scenes, ["import", "--from", "original", "--frame-size", "300"],
+         "--frame-size 300: not WIDTHxHEIGHT in pixels, such as 300x300"),
+        (scenes, ["import", "--from", "original", "--rooms", "a.csv"], "a.csv: No such file"),
         (scenes, ["import", "--from", "nowhere"], "nowhere: no folder"),
         (scenes, ["import", "--from", "original", "--out", "taken"], "--out taken: exists"),
         (scenes, ["import", "--from", "original", "--out", "no/a.npz"], "no such folder"),

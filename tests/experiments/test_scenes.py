@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import importlib
 import json
+import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,18 @@ def test_import(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert tables.classes == ("Desk", "Mug")
     assert tables.data_version in capsys.readouterr().out
     assert sorted(p.name for p in out.parent.iterdir()) == ["lab.json", "lab.npz"]
+
+
+def test_export_says_what_it_leaves_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["--scenes", "FloorPlan29", "FloorPlan428"]
+    scenes.main(["export", "--out", str(tmp_path / "out"), *given])
+    assert (
+        "Left out 480 states that are not connected to the largest part of their room: "
+        "FloorPlan29 (480). Of "
+    ) in (said := capsys.readouterr().out)
+    assert re.search(r"Of \d+ test episodes in the exported rooms, [1-9]\d* start there", said)
+    scenes.main(["export", "--out", str(tmp_path / "whole"), "--scenes", "FloorPlan428"])
+    assert "Left out" not in capsys.readouterr().out
 
 
 def test_inspect_own_and_bundled_rooms(scene_file: Path) -> None:

@@ -56,7 +56,7 @@ def read_scene(path: Path) -> None:
 
 
 def read_pickle(path: Path) -> None:
-    extras.read_episodes(path, {"FloorPlan21": GRID})
+    extras.read_episodes(path, {"FloorPlan21": extras.KnownRoom(GRID, {"Mug"})})
 
 
 def read_matrix(path: Path) -> None:

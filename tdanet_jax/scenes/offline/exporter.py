@@ -14,7 +14,9 @@ import numpy as np
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import hdf5
 from tdanet_jax.scenes.offline import layout
+from tdanet_jax.scenes.offline.connected import Connected, largest_parts
 from tdanet_jax.scenes.offline.layout import Report, state_keys
+from tdanet_jax.scenes.room_names import check_name
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.visibility.geometry import transitions
 from tdanet_jax.vocabulary import ROOM_TYPES
@@ -29,8 +31,8 @@ def write_folder(
     parents: Parents | None = None,
     vectors: np.ndarray | None = None,
     features: bool = False,
-) -> None:
-    """Writes a folder with one folder per scene, atomically.
+) -> Connected:
+    """Writes a folder with one folder per scene, atomically: of each, its largest connected part.
 
     Args:
       out: must not exist.
@@ -39,14 +41,23 @@ def write_folder(
       vectors: [C, D] one vector per class, for `thor_glove/glove_map<D>d.hdf5`.
       features: also write `resnet18_featuremap.hdf5`: channel c of a map is 1 in the cells of the
         7 x 7 raster with class c of `tables.classes`, and 0 elsewhere.
+
+    Returns:
+      What was written, and what was left out because it is not connected.
+
+    Raises:
+      SceneError: a scene's name is not a plain one.
     """
+    for name in tables.scenes:
+        check_name(name)
     if vectors is not None or features:
         hdf5.need_h5py(out)
+    connected = largest_parts(tables)
     temporary = files.partial_path(out)
     try:
         temporary.mkdir(parents=True)
         for i, name in enumerate(tables.scenes):
-            room = tables.subset([name])
+            room = connected.tables.subset([name])
             folder = temporary / name
             folder.mkdir()
             write_scene(room, folder)
@@ -61,6 +72,7 @@ def write_folder(
         if vectors is not None:
             write_vectors(tables.classes, vectors, temporary / "thor_glove")
         os.replace(temporary, out)
+        return connected
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -78,7 +90,10 @@ def write_scene(room: SceneTables, folder: Path) -> None:
 
 
 def graph(room: SceneTables, keys: Sequence[str]) -> dict[str, Any]:
-    """The moves in networkx's node-link form: a link per state and action that changes it."""
+    """The moves in networkx's node-link form: a link per state and action that changes it.
+
+    The list of links is there twice: networkx before 3.6 reads `links`, later versions `edges`.
+    """
     successor = transitions(room.next_position)
     links = [
         {"source": keys[state], "target": keys[to]}
@@ -92,6 +107,7 @@ def graph(room: SceneTables, keys: Sequence[str]) -> dict[str, Any]:
         "graph": {},
         "nodes": [{"id": key} for key in keys],
         "links": links,
+        "edges": links,
     }
 
 

@@ -3,30 +3,49 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tdanet_jax.io.untrusted import FileError, jsons, pickles
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
-from tdanet_jax.scenes.offline.layout import PARENT_FILE, ROOM_NAMES, Grid, scene_of
+from tdanet_jax.scenes.offline.layout import (
+    PARENT_FILE,
+    ROOM_NAMES,
+    Grid,
+    is_view,
+    scene_name,
+    state_key,
+)
 from tdanet_jax.vocabulary import ROOM_TYPES
 
 MOST_EPISODES, MOST_CLASSES = 100_000, 2_000
 LARGEST_REWARD = 100.0
+#: Number of episodes to name, of those that are left out for one reason.
+NAMED = 3
 #: Lists of episodes are called <room>_test.pkl and <room>_val.pkl.
 PARTS = ("test", "val")
 EPISODE_FOLDER, GRAPH_FOLDER = "test_val_split", "gcn"
 GRAPH_CLASSES, GRAPH_MATRIX = "objects.txt", "adjmat.dat"
 
 
-def read_extras(folders: Iterable[Path], grids: Mapping[str, Grid]) -> tuple[Extras, list[str]]:
-    """Each of the extras from the first folder that has it, and a line on each.
+class KnownRoom(NamedTuple):
+    """What an episode must fit."""
+
+    grid: Grid
+    classes: Collection[str]
+
+
+def read_extras(
+    folders: Iterable[Path], rooms: Mapping[str, KnownRoom]
+) -> tuple[Extras, list[str]]:
+    """Each of the extras from the first folder that has it, and lines on each.
 
     Args:
-      grids: the imported scenes; episodes in other scenes are left out.
+      rooms: the imported scenes; episodes that do not fit them are left out.
 
     Raises:
       FileError: a file is broken.
@@ -45,13 +64,20 @@ def read_extras(folders: Iterable[Path], grids: Mapping[str, Grid]) -> tuple[Ext
         lines.append(f"{adjacency}: a graph of {len(names)} classes")
     if published is not None:
         episodes: list[PublishedEpisode] = []
-        skipped = 0
+        left_out: dict[str, list[str]] = defaultdict(list)
         for path in sorted(p for part in PARTS for p in published.glob(f"*_{part}.pkl")):
-            kept, others = read_episodes(path, grids)
-            episodes, skipped = episodes + kept, skipped + others
+            kept, others = read_episodes(path, rooms)
+            episodes += kept
+            for reason, found in others.items():
+                left_out[reason] += found
         extras = dataclasses.replace(extras, episodes=tuple(episodes))
-        rest = f"; {skipped} in scenes that were not imported" if skipped else ""
-        lines.append(f"{published}: {len(episodes)} episodes{rest}")
+        lines.append(f"{published}: {len(episodes)} episodes")
+        for reason, found in left_out.items():
+            more = ", ..." if len(found) > NAMED else ""
+            lines.append(
+                f"{published}: {len(found)} episodes left out, {reason}: "
+                f"{', '.join(found[:NAMED])}{more}"
+            )
     return extras, lines
 
 
@@ -107,11 +133,13 @@ def read_graph(names_path: Path, matrix_path: Path) -> tuple[tuple[str, ...], np
     return names, plain
 
 
-def read_episodes(path: Path, grids: Mapping[str, Grid]) -> tuple[list[PublishedEpisode], int]:
-    """The episodes of `<room>_<test|val>.pkl` in known scenes, and the number of all others.
+def read_episodes(
+    path: Path, rooms: Mapping[str, KnownRoom]
+) -> tuple[list[PublishedEpisode], dict[str, list[str]]]:
+    """The episodes of `<room>_<test|val>.pkl` that fit the rooms, and all others, by reason.
 
     Raises:
-      FileError: it is not a list of episodes, or a start is not on its scene's grid.
+      FileError: it is not a list of episodes.
     """
     part = path.stem.rpartition("_")[2]
     if part not in PARTS or path.stat().st_size > pickles.LARGEST_FILE:
@@ -119,15 +147,29 @@ def read_episodes(path: Path, grids: Mapping[str, Grid]) -> tuple[list[Published
     records = pickles.load(path.read_bytes(), path)
     if not isinstance(records, list) or len(records) > MOST_EPISODES:
         raise FileError(path, "not a list of episodes")
-    found, others = [], 0
-    for episode in _episodes(path, records, part):
-        if episode.scene in grids:
-            grid = grids[episode.scene]
-            grid.state_at(path, episode.x, episode.z, episode.rotation, episode.horizon)
-            found.append(episode)
+    found: list[PublishedEpisode] = []
+    others: dict[str, list[str]] = defaultdict(list)
+    for i, episode in enumerate(_episodes(path, records, part)):
+        if reason := _misfit(episode, rooms.get(episode.scene)):
+            key = state_key(episode.x, episode.z, episode.rotation, episode.horizon)
+            name = f"episode {i} of {path.name} ({episode.scene:.40} {key} {episode.target:.40})"
+            others[reason].append("".join(c if c.isprintable() else "?" for c in name))
         else:
-            others += 1
+            found.append(episode)
     return found, others
+
+
+def _misfit(episode: PublishedEpisode, room: KnownRoom | None) -> str | None:
+    """Why an episode cannot be used, or None if it can."""
+    if room is None:
+        return "in rooms that were not imported"
+    if not is_view(episode.rotation, episode.horizon):
+        return "rotation or horizon not one of the task's"
+    if room.grid.point_at(episode.x, episode.z) is None:
+        return "start off the grid of grid.json"
+    if episode.target not in room.classes:
+        return "target not in the room"
+    return None
 
 
 def _episodes(path: Path, records: list[Any], part: str) -> Iterator[PublishedEpisode]:
@@ -138,9 +180,8 @@ def _episodes(path: Path, records: list[Any], part: str) -> Iterator[PublishedEp
         ):
             raise FileError(path, f"{where}: no scene, state and goal_object_type")
         scene, target = record["scene"], record["goal_object_type"]
-        known = scene_of(scene) if isinstance(scene, str) else None
-        if known is None or not isinstance(target, str):
-            raise FileError(path, f"{where}: {scene!r:.40} is not an iTHOR scene, or no target")
+        if not isinstance(scene, str) or not isinstance(target, str):
+            raise FileError(path, f"{where}: scene or goal_object_type is not text")
         if "glove_embedding" in record:  # only checked: word vectors come from --word-vectors
             pickles.array(record["glove_embedding"], path)
         state = record["state"]
@@ -151,4 +192,6 @@ def _episodes(path: Path, records: list[Any], part: str) -> Iterator[PublishedEp
             jsons.number(path, fields.get(name), f"{where}: {name}", 1000.0)
             for name in ("x", "z", "rotation", "horizon")
         )
-        yield PublishedEpisode(part, known[0], x, z, round(rotation), round(horizon), target)
+        yield PublishedEpisode(
+            part, scene_name(scene), x, z, round(rotation), round(horizon), target
+        )

@@ -15,16 +15,18 @@ from tdanet_jax.scenes import dataset
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.offline import layout
 from tdanet_jax.scenes.offline.layout import Grid, Report, find_root, find_scenes
+from tdanet_jax.scenes.room_names import Kinds
 from tdanet_jax.scenes.tables import SceneTables
 
 
-def find_features(folder: Path) -> dict[str, Path]:
-    """The feature file of each scene of a folder.
+def find_features(folder: Path, kinds: Kinds | None = None) -> dict[str, Path]:
+    """The feature file of each scene of a folder that is imported with these kinds of rooms.
 
     Raises:
       FileError: a scene has none, or h5py is not installed.
     """
-    found = {name: place / layout.FEATURE_FILE for name, _, place in find_scenes(find_root(folder))}
+    scenes, _ = find_scenes(find_root(folder), kinds)
+    found = {scene.name: scene.path / layout.FEATURE_FILE for scene in scenes}
     for path in found.values():
         hdf5.need_h5py(path)
         if not path.is_file():

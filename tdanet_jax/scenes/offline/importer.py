@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import shutil
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,52 +18,62 @@ from tdanet_jax.io import archive, files
 from tdanet_jax.io.untrusted import FileError, npz
 from tdanet_jax.scenes import cache
 from tdanet_jax.scenes.dataset import Rooms
-from tdanet_jax.scenes.offline import layout
-from tdanet_jax.scenes.offline.extras import read_extras
+from tdanet_jax.scenes.offline import frames, layout
+from tdanet_jax.scenes.offline.extras import KnownRoom, read_extras
 from tdanet_jax.scenes.offline.features import load_features as load_features  # its former place
-from tdanet_jax.scenes.offline.layout import Grid, Report, find_root, find_scenes
+from tdanet_jax.scenes.offline.frames import Frame
+from tdanet_jax.scenes.offline.layout import Grid, Report, SceneFolder, find_root, find_scenes
 from tdanet_jax.scenes.offline.reader import read_scene
+from tdanet_jax.scenes.room_names import Kinds
 from tdanet_jax.scenes.scene import MOST_CLASSES
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.tabulation import join, tabulate
 from tdanet_jax.vocabulary import ALL_TARGETS
 
 SOURCES = (layout.GRID_FILE, layout.GRAPH_FILE, layout.BOX_FILE, layout.OBJECT_FILE,
-           *layout.VISIBILITY_FILES)  # fmt: skip
+           layout.IMAGE_FILE, *layout.VISIBILITY_FILES)  # fmt: skip
 #: Version of the cached scenes, and part of their name.
-FORMAT = 2
+FORMAT = 3
+#: Share of the frame's width or height from which a box comes near its border.
+NEAR = 0.9
 
 
-def read_folder(folder: Path, report: Report) -> Rooms:
+def read_folder(
+    folder: Path, report: Report, kinds: Kinds | None = None, frame: Frame | None = None
+) -> Rooms:
     """The rooms of a folder of scenes, with the extras that are next to it.
 
     One scene's files are in memory at a time. Every scene is kept in the user's cache folder until
     `clear_cache` is called, so that an interrupted import continues where it stopped.
 
     Args:
-      folder: contains folders FloorPlan*, at most two levels down.
+      folder: contains folders of scenes, at most two levels down.
       report: called for every scene and every further file.
+      kinds: room type and part of rooms whose names do not say them.
+      frame: the frame in whose pixels the boxes are; None: as the folders say, or the usual one.
 
     Raises:
       FileError: there are no scenes, or a file is broken.
     """
     root = find_root(folder)
-    chosen = find_scenes(root)
+    chosen, left_out = find_scenes(root, kinds)
     cached = _cache_folder(root)
     cache.touch(cached)
     rooms: list[SceneTables] = []
-    for name, room_type, place in chosen:
-        room, line = _read_cached(cached, place, name, room_type)
+    for scene in chosen:
+        room, line = _read_cached(cached, scene, frame)
         rooms.append(room)
         report(len(rooms) / len(chosen), line)
-    for other in sorted(root.glob("FloorPlan*")):
-        if other.is_dir() and layout.scene_of(other.name) is None:
-            report(1.0, f"{other.name}: left out, not one of iTHOR's 120 rooms")
-    grids = {room.scenes[0]: Grid(room.position) for room in rooms}
+    _warn_of_borders(rooms)
+    known = {
+        room.scenes[0]: KnownRoom(Grid(room.position), frozenset(room.classes)) for room in rooms
+    }
     # The reference keeps its test episodes two folders above the scenes.
     places = [root, folder, folder / "data", *root.resolve().parents[:2]]
-    extras, lines = read_extras(places, grids)
-    for line in lines:
+    extras, lines = read_extras(places, known)
+    parts = {scene.name: scene.kind.part for scene in chosen if scene.kind.part is not None}
+    extras = dataclasses.replace(extras, parts=parts)
+    for line in (*left_out, *lines):
         report(1.0, line)
     classes = sorted({name for room in rooms for name in room.classes})
     if len(classes) > MOST_CLASSES:
@@ -71,21 +84,42 @@ def read_folder(folder: Path, report: Report) -> Rooms:
     return Rooms(join(rooms, classes).with_known_targets(), extras)
 
 
+def _warn_of_borders(rooms: Sequence[SceneTables]) -> None:
+    """Warns of rooms in which no box comes near the right or the lower border.
+
+    In a real room some objects always leave the view; so the frames were probably smaller.
+    """
+    far = [
+        room.scenes[0]
+        for room in rooms
+        if 0
+        <= room.row_box[:, 2:].max(axis=0, initial=-1).min()
+        < NEAR * room.image * room.subpixel
+    ]
+    if far:
+        more = f" and in {len(far) - 3} more rooms" if len(far) > 3 else ""
+        warnings.warn(
+            f"no box comes near the right or the lower border of the frame in {', '.join(far[:3])}"
+            f"{more}; if the frames were smaller, import with {frames.FLAG}",
+            stacklevel=2,
+        )
+
+
 def _cache_folder(root: Path) -> Path:
     name = hashlib.sha256(str(root.resolve()).encode()).hexdigest()[:16]
     return cache.folder() / f"{cache.IMPORTS}{FORMAT}-{name}"
 
 
-def _read_cached(cached: Path, place: Path, name: str, room_type: int) -> tuple[SceneTables, str]:
+def _read_cached(cached: Path, scene: SceneFolder, frame: Frame | None) -> tuple[SceneTables, str]:
     """A scene and a line on it, cached if it was read from files of equal sizes and dates."""
-    path = cached / f"{name}.npz"
-    stamp = _stamp(place)
+    path = cached / f"{scene.name}.npz"
+    stamp = [scene.kind.room_type, str(frame), *_stamp(scene.path)]
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         arrays = npz.read(path)
         note = json.loads(arrays["import/note"].tobytes())
         if note["stamp"] == stamp:
             return SceneTables.from_arrays(arrays), note["line"]
-    data = read_scene(place, name, room_type)
+    data = read_scene(scene.path, scene.name, scene.kind.room_type, frame)
     room = tabulate(data.scene, data.next_position, data.detections, ALL_TARGETS)
     note = json.dumps({"stamp": stamp, "line": data.describe()}).encode()
     with contextlib.suppress(OSError):  # without a cache, an import starts again

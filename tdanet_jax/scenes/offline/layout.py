@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,12 +13,13 @@ from tdanet_jax import poses
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes.metadata import ALIGNED
-from tdanet_jax.splits import SCENE_NUMBERS
-from tdanet_jax.vocabulary import ROOM_TYPES
+from tdanet_jax.scenes.room_names import Kinds, RoomKind, check_name, kind_of, sort_key
+from tdanet_jax.scenes.scene import SceneError
 
 GRID_FILE, GRAPH_FILE, BOX_FILE = "grid.json", "graph.json", "objects_bb.json"
+METADATA_FILE, IMAGE_FILE = "metadata.json", "images.hdf5"
 #: In order of preference: both names of the visibility map, then the raw metadata.
-VISIBILITY_FILES = ("visible_object_map_1.5.json", "visible_object_map.json", "metadata.json")
+VISIBILITY_FILES = ("visible_object_map_1.5.json", "visible_object_map.json", METADATA_FILE)
 #: Our addition: what the original layout lacks of our tables.
 OBJECT_FILE = "objects.json"
 FEATURE_FILE = "resnet18_featuremap.hdf5"
@@ -29,21 +31,29 @@ ROOM_NAMES = ("Kitchen", "Living_Room", "Bedroom", "Bathroom")
 #: Called with the share that is done and a line of text.
 Report = Callable[[float, str], None]
 
-_SCENE = re.compile(r"FloorPlan(\d{1,4})(_physics)?")
 _NUMBER = r"(-?\d{1,4}(?:\.\d{1,9})?)"
 _KEY = re.compile(rf"{_NUMBER}\|{_NUMBER}\|(\d{{1,3}})(?:\.0)?\|(\d{{1,2}})(?:\.0)?")
 
 
-def scene_of(name: str) -> tuple[str, int] | None:
-    """Name and room type of an iTHOR scene, with or without "_physics", or None."""
-    match = _SCENE.fullmatch(name)
-    if match is None:
-        return None
-    number = int(match[1])
-    for room_type, room in enumerate(ROOM_TYPES):
-        if number in SCENE_NUMBERS[room]:
-            return f"FloorPlan{number}", room_type
-    return None
+class SceneFolder(NamedTuple):
+    """A folder with the files of a scene."""
+
+    name: str
+    kind: RoomKind
+    path: Path
+
+
+def scene_name(folder: str) -> str:
+    """The scene in a folder called `folder`: FloorPlan1 for FloorPlan1_physics as well."""
+    plain = folder.removesuffix("_physics")
+    return plain if kind_of(plain) is not None else folder
+
+
+def _is_scene(place: Path) -> bool:
+    """Whether a folder holds a scene: it has the name of an iTHOR room, or a file of points."""
+    kind = kind_of(scene_name(place.name))
+    is_ithor = kind is not None and kind.part is None
+    return place.is_dir() and (is_ithor or (place / GRID_FILE).is_file())
 
 
 def find_root(folder: Path) -> Path:
@@ -52,28 +62,46 @@ def find_root(folder: Path) -> Path:
     Raises:
       FileError: there is none.
     """
-    for pattern in ("FloorPlan*", "*/FloorPlan*", "*/*/FloorPlan*"):
+    for pattern in ("*", "*/*", "*/*/*"):
         for place in sorted(folder.glob(pattern)):
-            if place.is_dir() and scene_of(place.name) is not None:
+            if _is_scene(place):
                 return place.parent
-    raise FileError(folder, "no folder, or no folders FloorPlan1 to FloorPlan430 in it")
+    raise FileError(folder, f"no folder, or no folders of rooms (with a {GRID_FILE}) in it")
 
 
-def find_scenes(root: Path) -> list[tuple[str, int, Path]]:
-    """Name, room type and folder of each scene, by room type and number.
+def find_scenes(root: Path, kinds: Kinds | None = None) -> tuple[list[SceneFolder], list[str]]:
+    """The scenes of a folder, by room type, name and number; and lines on what is left out.
 
     Raises:
-      FileError: two folders belong to one scene.
+      FileError: two folders belong to one scene, or no scene is left.
     """
-    found: dict[str, tuple[str, int, Path]] = {}
-    for place in sorted(root.glob("FloorPlan*")):
-        known = scene_of(place.name)
-        if known is None or not place.is_dir():
+    kinds = kinds or Kinds()
+    found: dict[str, SceneFolder] = {}
+    left_out = []
+    for place in sorted(root.iterdir()):
+        name = scene_name(place.name)
+        if not _is_scene(place):
+            if place.is_dir() and name.startswith("FloorPlan"):
+                left_out.append(f"{name}: left out, has no {GRID_FILE}")
             continue
-        if known[0] in found:
-            raise FileError(place, f"{known[0]} is there twice")
-        found[known[0]] = (*known, place)
-    return sorted(found.values(), key=lambda scene: (scene[1], int(scene[0][9:])))
+        try:
+            check_name(name)
+        except SceneError as error:
+            left_out.append(f"left out: {error}")
+            continue
+        kind = kinds.of(name)
+        if kind is None:
+            left_out.append(f"{name}: left out, --room-type or --rooms must say its type")
+        elif name in found:
+            raise FileError(place, f"{name} is there twice")
+        else:
+            found[name] = SceneFolder(name, kind, place)
+    if rest := sorted(kinds.table.keys() - found.keys(), key=sort_key):
+        listed = ", ".join(rest[:3]) + (", ..." if len(rest) > 3 else "")
+        left_out.append(f"{len(rest)} rooms of the table of rooms are not in the folder: {listed}")
+    if not found:
+        raise FileError(root, f"no room to import; {left_out[0] if left_out else 'it is empty'}")
+    return sorted(found.values(), key=lambda s: (s.kind.room_type, sort_key(s.name))), left_out
 
 
 def state_key(x: float, z: float, rotation: int, horizon: int) -> str:
@@ -91,6 +119,11 @@ def state_keys(points: np.ndarray) -> list[str]:
         for x, _, z in points
         for view in range(poses.VIEWS)
     ]
+
+
+def is_view(rotation: int, horizon: int) -> bool:
+    """Whether rotation and horizon, in degrees, are among those of the task."""
+    return rotation in range(0, 360, 45) and horizon in (0, 30)
 
 
 class Grid:
@@ -128,11 +161,17 @@ class Grid:
           FileError: there is none.
         """
         key = state_key(x, z, rotation, horizon)
-        if rotation % 45 or not 0 <= rotation < 360 or horizon not in (0, 30):
+        if not is_view(rotation, horizon):
             raise FileError(path, f"state {key}: rotation or horizon is not one of the task's")
-        steps = (np.array([x, z]) - self._origin) / GRID_SIZE
-        cell = np.rint(steps)
-        point = self._index.get((int(cell[0]), int(cell[1])))
-        if point is None or np.abs(steps - cell).max() * GRID_SIZE > ALIGNED:
+        point = self.point_at(x, z)
+        if point is None:
             raise FileError(path, f"state {key} is not on the grid of grid.json")
         return poses.from_degrees(point, rotation, horizon)
+
+    def point_at(self, x: float, z: float) -> int | None:
+        """The reachable point at (x, z) metres, or None."""
+        steps = (np.array([x, z]) - self._origin) / GRID_SIZE
+        cell = np.rint(steps)
+        if np.abs(steps - cell).max() * GRID_SIZE > ALIGNED:
+            return None
+        return self._index.get((int(cell[0]), int(cell[1])))

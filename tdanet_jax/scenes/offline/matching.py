@@ -1,4 +1,7 @@
-"""Matching boxes, which the original layout lists by class, to objects, which it lists by id."""
+"""Matching boxes, which the original layout lists by class, to objects, which it lists by id.
+
+Some recordings list boxes by id as well.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +14,13 @@ import numpy as np
 
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes.offline.layout import OBJECT_FILE
+from tdanet_jax.scenes.offline.object_ids import UNKNOWN, class_of, is_id, place_in
 from tdanet_jax.scenes.scene import Scene, SceneObject
 from tdanet_jax.scenes.visibility.build import Detections
 
 MOST_OBJECTS = 20_000
 #: The box in the image of an object that is visible, but has none in the data.
 NO_BOX = (-1, -1, -1, -1)
-#: The box in metres of an object whose place is unknown.
-UNKNOWN = np.full((2, 3), np.nan)
 
 
 @dataclass
@@ -52,11 +54,15 @@ class BoxMatcher:
     Args:
       path: the file of boxes, for messages.
       owners: state -> ids of the objects to which its boxes belong, in order; None if unknown.
+
+    Attributes:
+      names: the classes or ids by which boxes were listed.
     """
 
     def __init__(
         self, path: Path, objects: Objects, owners: dict[int, list[str]] | None = None
     ) -> None:
+        self.names: set[str] = set()
         self._path = path
         self._objects = objects
         self._owners = owners
@@ -73,7 +79,7 @@ class BoxMatcher:
         """Adds the rows of all states: those with boxes, then visible objects without one.
 
         Raises:
-          FileError: the boxes do not fit their owners.
+          FileError: the boxes do not fit their owners, or an object has two in one state.
         """
         done = set()
         for state, groups in boxes:
@@ -81,7 +87,10 @@ class BoxMatcher:
                 continue
             done.add(state)
             visible = self._visible.get(state, set())
-            if self._owners is None:
+            self.names.update(groups)
+            if any(map(is_id, groups)):
+                pairs = [p for name, boxes in groups.items() for p in self._by_id(name, boxes)]
+            elif self._owners is None:
                 pairs = [
                     p for kind, group in groups.items() for p in self._guess(kind, group, visible)
                 ]
@@ -92,6 +101,13 @@ class BoxMatcher:
             self._rows += [(state, name, NO_BOX, True) for name in lacking]
         for state in self._visible.keys() - done:
             self._rows += [(state, name, NO_BOX, True) for name in self._visible[state]]
+
+    def _by_id(self, name: str, boxes: np.ndarray) -> list:
+        if len(boxes) > 1:
+            raise FileError(self._path, f"{name}: {len(boxes)} boxes of one object in a state")
+        if name not in self._objects.classes:  # visible from nowhere
+            self._objects.add(self._path, name, class_of(name), place_in(name))
+        return [(name, tuple(box)) for box in boxes.tolist()]
 
     def _look_up(self, owners: list[str], groups: dict[str, np.ndarray]) -> list:
         classes = [kind for kind, boxes in groups.items() for _ in boxes]

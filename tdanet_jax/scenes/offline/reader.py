@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,17 +14,20 @@ from tdanet_jax import poses
 from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.poses import GRID_SIZE, HORIZONS, ROTATIONS, STEPS, VIEWS
 from tdanet_jax.scenes.metadata import FARTHEST, check_points
-from tdanet_jax.scenes.offline import layout
+from tdanet_jax.scenes.offline import frames, layout
+from tdanet_jax.scenes.offline.frames import Frame
 from tdanet_jax.scenes.offline.layout import Grid
-from tdanet_jax.scenes.offline.matching import MOST_OBJECTS, UNKNOWN, BoxMatcher, Objects
+from tdanet_jax.scenes.offline.matching import MOST_OBJECTS, BoxMatcher, Objects
+from tdanet_jax.scenes.offline.object_ids import UNKNOWN, class_of, is_id, place_in
 from tdanet_jax.scenes.scene import SUBPIXEL, Scene, SceneError
 from tdanet_jax.scenes.visibility.build import Detections
 from tdanet_jax.scenes.visibility.geometry import transitions
 from tdanet_jax.vocabulary import IMAGE_SIZE
 
-#: Pixels by which a box may leave the image, to which it is then clipped.
+#: Pixels by which a box may leave the frame, to which it is then clipped.
 OVERHANG = 1.0
 MOST_POINTS = 20_000
+_CLASS = re.compile(r"[A-Za-z][A-Za-z0-9]*")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,8 +46,11 @@ class SceneData:
         return f"{line}; noted: {', '.join(self.noted)}" if self.noted else line
 
 
-def read_scene(folder: Path, name: str, room_type: int) -> SceneData:
+def read_scene(folder: Path, name: str, room_type: int, frame: Frame | None = None) -> SceneData:
     """Reads the files of a scene, one after the other.
+
+    Args:
+      frame: the frame in whose pixels the boxes are; None: as the folder says, or the usual one.
 
     Raises:
       FileError: a file is missing or broken, or contradicts another.
@@ -62,11 +69,18 @@ def read_scene(folder: Path, name: str, room_type: int) -> SceneData:
         found.append(layout.OBJECT_FILE)
     boxes: Iterator[tuple[int, dict[str, np.ndarray]]] = iter(())
     if (folder / layout.BOX_FILE).is_file():
-        boxes = read_boxes(folder / layout.BOX_FILE, grid)
+        frame, remarks = _frame(folder, frame)
+        noted += remarks
+        boxes = read_boxes(folder / layout.BOX_FILE, grid, frame)
     else:
         noted.append(f"no {layout.BOX_FILE}, so no detections")
     matcher = BoxMatcher(folder / layout.BOX_FILE, objects, owners)
     matcher.add(boxes)
+    if odd_names := sorted(n for n in matcher.names if not is_id(n) and not _CLASS.fullmatch(n)):
+        noted.append(
+            f"{len(odd_names)} names of boxes that look like neither a class nor an object's id, "
+            f"taken as classes: {', '.join(odd_names[:3])}"
+        )
     scene, detections = matcher.finish(name, room_type, grid.points)
     boxed = int((detections.box[:, 0] >= 0).sum())
     if boxed:
@@ -74,6 +88,18 @@ def read_scene(folder: Path, name: str, room_type: int) -> SceneData:
     if boxed and len(detections.box) > boxed:
         noted.append(f"{len(detections.box) - boxed} times an object is visible and has no box")
     return SceneData(scene, next_position, detections, tuple(found), tuple(noted))
+
+
+def _frame(folder: Path, given: Frame | None) -> tuple[Frame, list[str]]:
+    """The frame of a scene's boxes, and remarks on where its size comes from."""
+    found, source = frames.recorded(folder)
+    if given is None and found is None:
+        return frames.USUAL, [f"{source}; frames taken as {frames.USUAL}"] if source else []
+    if given is None and found is not None:
+        return found, [] if found == frames.USUAL else [f"frames of {found} by {source}"]
+    assert given is not None
+    differs = found is not None and found != given
+    return given, [f"frames of {found} by {source}, read as {given}"] if differs else []
 
 
 def read_grid(path: Path) -> Grid:
@@ -113,6 +139,8 @@ def read_graph(path: Path, grid: Grid) -> tuple[np.ndarray, list[str]]:
     nodes, links = content.get("nodes"), content.get("links", content.get("edges"))
     if not isinstance(nodes, list) or not isinstance(links, list):
         raise FileError(path, "not a node-link graph (no nodes and links)")
+    if content.get("edges", links) != links:
+        raise FileError(path, "links and edges, two names for one list, differ")
     names = [node.get("id") if isinstance(node, Mapping) else None for node in nodes]
     states = {str(name): grid.state(path, name) for name in names}
     order = [states[str(name)] for name in names]
@@ -197,28 +225,6 @@ def _add_record(path: Path, objects: Objects, record: Any, state: int) -> None:
         objects.states[name].add(state)
 
 
-def class_of(name: str) -> str:
-    """The class in an object's id: its first part, or its last if that is a name.
-
-    "Mug|+00.10|+00.93|-01.20" is a Mug, "Sink|+00.10|+00.93|-01.20|SinkBasin" a SinkBasin,
-    "Apple|+00.10|+00.93|-01.20|AppleSliced_3" an AppleSliced.
-    """
-    parts = name.split("|")
-    last = parts[-1].rpartition("_")[0] or parts[-1]
-    return last if len(parts) > 4 and last.isalpha() else parts[0]
-
-
-def place_in(name: str) -> np.ndarray:
-    """The place in an object's id, as a box [2, 3] without extent, in metres; NaN without one."""
-    try:
-        place = np.array([float(part) for part in name.split("|")[1:4]])
-    except ValueError:
-        return UNKNOWN
-    if place.shape != (3,) or not (np.abs(place) <= FARTHEST).all():
-        return UNKNOWN
-    return np.stack([place, place])
-
-
 def read_objects(path: Path, grid: Grid, objects: Objects) -> dict[int, list[str]]:
     """Adds the objects of our `objects.json`.
 
@@ -259,30 +265,44 @@ def _extent(path: Path, name: str, record: Mapping[str, Any]) -> np.ndarray:
     return np.array(numbers).reshape(2, 3)
 
 
-def read_boxes(path: Path, grid: Grid) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """Each state, with its boxes by class, [n, 4] in sixteenths of a pixel.
+def read_boxes(
+    path: Path, grid: Grid, frame: Frame = frames.USUAL
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """Each state, with its boxes by class or by object id, [n, 4] in the units of the tables.
 
     Raises:
-      FileError: a number is missing, not finite or outside the image.
+      FileError: some names are classes and some are ids, or a number is missing, not finite or
+        outside of the frame.
     """
+    first = None  # the first name: all are ids, or none is
     for key, groups in jsons.members(path):
         state = grid.state(path, key)
         if not isinstance(groups, Mapping):
             raise FileError(path, f"{key}: not classes with boxes")
-        yield state, {name: _boxes(path, key, name, flat) for name, flat in groups.items()}
+        for name in groups:
+            first = name if first is None else first
+            if "|" in name and not is_id(name):
+                raise FileError(path, f"{key}: {name!r} is neither a class nor an object's id")
+            if is_id(name) != is_id(first):
+                raise FileError(path, f"{key}: both classes and ids of objects: {first}, {name}")
+        yield state, {name: _boxes(path, key, name, flat, frame) for name, flat in groups.items()}
 
 
-def _boxes(path: Path, key: str, name: str, flat: Any) -> np.ndarray:
+def _boxes(path: Path, key: str, name: str, flat: Any, frame: Frame) -> np.ndarray:
     where = f"{key}: {name}"
     if not name or not isinstance(flat, list) or len(flat) % 4 or len(flat) > 4 * MOST_OBJECTS:
         raise FileError(path, f"{where}: not four numbers per box")
     if not all(type(value) in (int, float) for value in flat):
         raise FileError(path, f"{where}: a pixel that is not a number")
     pixels = np.array([min(max(value, -1e6), 1e6) for value in flat], np.float64).reshape(-1, 4)
-    inside = (pixels >= -OVERHANG) & (pixels <= IMAGE_SIZE + OVERHANG)  # False for NaN
+    size = np.array([*frame, *frame])
+    inside = (pixels >= -OVERHANG) & (pixels <= size + OVERHANG)  # False for NaN
     if not inside.all():
-        raise FileError(path, f"{where}: a pixel that is not finite or not in the image")
-    pixels = np.clip(pixels, 0, IMAGE_SIZE)
+        raise FileError(
+            path, f"{where}: a pixel outside of a frame of {frame}; {frames.FLAG} says another size"
+        )
+    # The tables' frame is square: boxes keep their shares of width and height.
+    pixels = np.clip(pixels, 0, size) * (IMAGE_SIZE / size)
     corners = np.hstack([np.minimum(pixels[:, :2], pixels[:, 2:]),
                          np.maximum(pixels[:, :2], pixels[:, 2:])])  # fmt: skip
     return np.rint(corners * SUBPIXEL).astype(np.int16)

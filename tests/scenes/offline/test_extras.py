@@ -17,6 +17,7 @@ from tdanet_jax.evaluation import episodes
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.offline import extras, importer
+from tdanet_jax.scenes.offline.extras import KnownRoom
 from tdanet_jax.task import make_task
 from tdanet_jax.words import WordVectors
 from tests.support import original
@@ -123,23 +124,18 @@ class Command:
         return os.system, (f"touch {self.made}",)
 
 
-def test_broken_episodes(tmp_path: Path, rooms: Rooms) -> None:
-    grids = {"FloorPlan1": extras.Grid(rooms.tables.position[:3])}
+def test_broken_episodes(tmp_path: Path, known: dict[str, KnownRoom]) -> None:
     path, made = tmp_path / "kitchen_test.pkl", tmp_path / "made"
     with original.fake_torch():
         [good] = original.episodes([("FloorPlan1", 0.25, 90, "Mug")])
-        [off] = original.episodes([("FloorPlan1", 0.30, 90, "Mug")])
-        [turned] = original.episodes([("FloorPlan1", 0.25, 91, "Mug")])
         [inside] = original.episodes([("FloorPlan1", float("nan"), 90, "Mug")])
         cases = [
             ([good], None),
             (good, "not a list of episodes"),
             ([3], "episode 0: no scene, state and goal_object_type"),
-            ([{**good, "scene": "../../etc/passwd"}], "is not an iTHOR scene"),
+            ([{**good, "scene": 3}], "scene or goal_object_type is not text"),
             ([{**good, "state": {"x": 0}}], "its state is not a ThorAgentState"),
             ([{**good, "glove_embedding": "text"}], "something other than an array"),
-            ([off], "is not on the grid"),
-            ([turned], "rotation or horizon"),
             ([inside], "z is not finite"),
             ([good, Command(made)], "system"),
         ]
@@ -147,11 +143,54 @@ def test_broken_episodes(tmp_path: Path, rooms: Rooms) -> None:
     for data, reason in written:
         path.write_bytes(data)
         if reason is None:
-            assert len(extras.read_episodes(path, grids)[0]) == 1
+            assert len(extras.read_episodes(path, known)[0]) == 1
             continue
         with pytest.raises(FileError, match=rf"kitchen_test\.pkl: .*{reason}"):
-            extras.read_episodes(path, grids)
+            extras.read_episodes(path, known)
     assert not made.exists()
     (tmp_path / "kitchen_train.pkl").write_bytes(written[0][0])
     with pytest.raises(FileError, match="not named"):
-        extras.read_episodes(tmp_path / "kitchen_train.pkl", grids)
+        extras.read_episodes(tmp_path / "kitchen_train.pkl", known)
+
+
+@pytest.fixture
+def known(rooms: Rooms) -> dict[str, KnownRoom]:
+    return {"FloorPlan1": KnownRoom(extras.Grid(rooms.tables.position[:3]), {"Mug"})}
+
+
+def test_episodes_that_do_not_fit_are_left_out_and_named(
+    tmp_path: Path, known: dict[str, KnownRoom]
+) -> None:
+    listed = [
+        ("FloorPlan1", 0.25, 90, "Mug"),
+        *[("FloorPlan1", 0.3 + i, 90, "Mug") for i in range(4)],  # between points
+        ("FloorPlan1", 0.75, 90, "Mug"),  # past the last
+        ("FloorPlan1", 0.25, 91, "Mug"),
+        ("FloorPlan1", 0.25, 360, "Mug"),
+        ("FloorPlan2-1", 0.25, 90, "Mug"),
+        ("../../etc\n/passwd", 0.25, 90, "Mug"),
+        ("FloorPlan1", 0.25, 90, "Toaster"),
+        ("FloorPlan1_physics", 0.5, 0, "Mug"),
+    ]
+    folder = tmp_path / "lists" / "test_val_split"
+    folder.mkdir(parents=True)
+    with original.fake_torch():
+        (folder / "kitchen_test.pkl").write_bytes(pickle.dumps(original.episodes(listed)))
+    found, lines = extras.read_extras([tmp_path / "lists"], known)
+    assert [(e.scene, e.z) for e in found.episodes] == [("FloorPlan1", 0.25), ("FloorPlan1", 0.5)]
+    of = "of kitchen_test.pkl"
+    assert [line.removeprefix(f"{folder}: ") for line in lines] == [
+        "2 episodes",
+        "5 episodes left out, start off the grid of grid.json: "
+        f"episode 1 {of} (FloorPlan1 -0.00|0.30|90|0 Mug), "
+        f"episode 2 {of} (FloorPlan1 -0.00|1.30|90|0 Mug), "
+        f"episode 3 {of} (FloorPlan1 -0.00|2.30|90|0 Mug), ...",
+        "2 episodes left out, rotation or horizon not one of the task's: "
+        f"episode 6 {of} (FloorPlan1 -0.00|0.25|91|0 Mug), "
+        f"episode 7 {of} (FloorPlan1 -0.00|0.25|360|0 Mug)",
+        "2 episodes left out, in rooms that were not imported: "
+        f"episode 8 {of} (FloorPlan2-1 -0.00|0.25|90|0 Mug), "
+        f"episode 9 {of} (../../etc?/passwd -0.00|0.25|90|0 Mug)",
+        "1 episodes left out, target not in the room: "
+        f"episode 10 {of} (FloorPlan1 -0.00|0.25|90|0 Toaster)",
+    ]

@@ -11,6 +11,7 @@ import pytest
 
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes.offline import layout, matching, reader
+from tdanet_jax.scenes.offline.frames import Frame
 from tdanet_jax.scenes.offline.reader import SceneData
 from tests.support import original
 from tests.support.original import APPLE, KEYS, MUG, TABLE
@@ -72,7 +73,9 @@ def test_links_by_name_and_links_called_edges_are_the_same(folder: Path) -> None
 
     change(folder, "graph.json", new_style)
     np.testing.assert_array_equal(read(folder).next_position, before)
-    change(folder, "graph.json", lambda graph: graph.update(edges=graph.pop("links")))
+    change(folder, "graph.json", lambda graph: graph.update(edges=graph["links"]))
+    np.testing.assert_array_equal(read(folder).next_position, before)
+    change(folder, "graph.json", lambda graph: graph.pop("links") and None)
     np.testing.assert_array_equal(read(folder).next_position, before)
 
 
@@ -161,14 +164,91 @@ def test_keys_with_and_without_a_sign_are_equal(folder: Path) -> None:
     assert rows(read(folder)) == rows(before)
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [("Mug|+00.10|+00.93|-01.20", "Mug"), ("Sink|+00.10|+00.93|-01.20|SinkBasin", "SinkBasin"),
-     ("Apple|+00.10|+00.93|-01.20|AppleSliced_3", "AppleSliced"), ("Mug", "Mug"),
-     ("Cup|surface|2|+01.00|7", "Cup")],
-)  # fmt: skip
-def test_classes_in_ids(name: str, kind: str) -> None:
-    assert reader.class_of(name) == kind
+def by_id(boxes: dict) -> dict:
+    """The miniature's boxes under the ids of their objects; the second mug is nowhere visible."""
+    names = {"TableTop": [TABLE], "Apple": [APPLE]}
+    return {
+        key: {
+            name: group[4 * i : 4 * i + 4]
+            for kind, group in groups.items()
+            for i, name in enumerate(names.get(kind, [FAR_MUG, MUG] if len(group) > 4 else [MUG]))
+        }
+        for key, groups in boxes.items()
+    }
+
+
+FAR_MUG = "Mug|-01.00|+01.00|+09.00"
+
+
+def test_boxes_by_object_id(folder: Path) -> None:
+    """The ids say whose a box is, and several instances of a class stay several."""
+    before = rows(read(folder))
+    change(folder, "objects_bb.json", by_id)
+    data = read(folder)
+    assert {item.object_class for item in data.scene.objects} == {"Apple", "Mug", "TableTop"}
+    assert rows(data) == {
+        (state, name.replace("Mug|unnamed|0", FAR_MUG), box, visible)
+        for state, name, box, visible in before
+    }
+    assert not any("names of boxes" in note for note in data.noted)
+
+
+def test_ids_outweigh_the_size_of_boxes(folder: Path) -> None:
+    """By class, the larger box would be the visible mug's."""
+
+    def swap(boxes: dict) -> dict:
+        named = by_id(boxes)
+        view = named["-0.00|0.50|0|0"]
+        view[MUG], view[FAR_MUG] = view[FAR_MUG], view[MUG]
+        return named
+
+    change(folder, "objects_bb.json", swap)
+    assert (32, MUG, (5, 150, 15, 160), True) in rows(read(folder))
+
+
+def test_a_basin_is_not_its_sink(folder: Path) -> None:
+    basin = "Sink|+00.10|+00.93|-01.20|SinkBasin"
+    boxes = {KEYS[0]: {basin: [0, 0, 300, 300], "Sink|1|2": [0, 0, 10, 10]}}
+    change(folder, "objects_bb.json", lambda _: boxes)
+    kinds = {o.object_id: o.object_class for o in read(folder).scene.objects}
+    assert (kinds[basin], kinds["Sink|1|2"]) == ("SinkBasin", "Sink")
+
+
+def test_names_of_boxes_that_are_neither_classes_nor_ids_are_noted(folder: Path) -> None:
+    boxes = {KEYS[0]: {"Mug_1a2b": [0, 0, 1, 1], "coffee machine": [], "Mug": []}}
+    change(folder, "objects_bb.json", lambda _: boxes)
+    assert (
+        "2 names of boxes that look like neither a class nor an object's id, taken as classes: "
+        "Mug_1a2b, coffee machine"
+    ) in read(folder).noted
+
+
+def test_boxes_of_another_frame(folder: Path) -> None:
+    """They keep their shares of the frame."""
+    wide = {
+        key: {
+            name: [[2, 1.5][i % 2] * value for i, value in enumerate(group)]
+            for name, group in groups.items()
+        }
+        for key, groups in original.BOXES.items()
+    }
+    before = rows(read(folder))
+    change(folder, "objects_bb.json", lambda _: wide)
+    with pytest.raises(FileError, match=r"frame of 300x300; --frame-size WIDTHxHEIGHT"):
+        read(folder)
+    assert rows(reader.read_scene(folder, "FloorPlan1", 0, Frame(600, 450))) == before
+    (folder / "metadata.json").write_text('{"a": {"screenWidth": 600, "screenHeight": 450}}')
+    data = read(folder)
+    assert rows(data) == before
+    assert "frames of 600x450 by metadata.json" in data.noted
+    data = reader.read_scene(folder, "FloorPlan1", 0, Frame(1200, 900))
+    assert rows(data) != before
+    assert "frames of 600x450 by metadata.json, read as 1200x900" in data.noted
+    (folder / "images.hdf5").write_bytes(b"damaged")
+    (folder / "metadata.json").unlink()
+    change(folder, "objects_bb.json", lambda _: original.BOXES)
+    [note] = [note for note in read(folder).noted if "images.hdf5" in note]
+    assert note.endswith("frames taken as 300x300")
 
 
 @pytest.mark.parametrize(
@@ -196,6 +276,7 @@ BAD: list[tuple[str, Any, str]] = [
     ("grid.json", lambda c: c[:2], None),
     ("graph.json", lambda c: [1], "not a node-link graph"),
     ("graph.json", lambda c: c.pop("links") and None, "not a node-link graph"),
+    ("graph.json", lambda c: c.update(edges=c["links"][1:]), "links and edges"),
     ("graph.json", lambda c: c["links"].append({"source": 0, "target": 48}), "target 48 is not"),
     ("graph.json", lambda c: c["links"].append({"source": "9.00|0.00|0|0", "target": 0}),
      "source '9.00|0.00|0|0' is not among the nodes"),
@@ -214,7 +295,11 @@ BAD: list[tuple[str, Any, str]] = [
     ("objects_bb.json", lambda c: c.update({KEYS[0]: []}), "not classes with boxes"),
     ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug": [1, 2, 3]}}), "four numbers per box"),
     ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug": [0, 0, 1, None]}}), "is not a number"),
-    ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug": [0, 0, 1, 302]}}), "not in the image"),
+    ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug": [0, 0, 1, 302]}}), "outside of a fr"),
+    ("objects_bb.json", lambda c: c.update({KEYS[0]: {MUG: []}}), "both classes and ids of objec"),
+    ("objects_bb.json", lambda c: c.update({KEYS[0]: {"Mug|": []}}), "neither a class nor an obj"),
+    ("objects_bb.json", lambda c: {KEYS[0]: {MUG: [1] * 8}},
+     "2 boxes of one object"),
 ]  # fmt: skip
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import warnings
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +20,10 @@ from tdanet_jax.env.reward import find_parents, named_parents, published_parents
 from tdanet_jax.io.untrusted import FileError, hdf5
 from tdanet_jax.scenes import SceneTables, dataset, tabulation
 from tdanet_jax.scenes.offline import exporter, features, importer, layout, reader
-from tdanet_jax.scenes.offline.layout import OBJECT_FILE, state_keys
+from tdanet_jax.scenes.offline.frames import Frame
+from tdanet_jax.scenes.offline.layout import OBJECT_FILE, SceneFolder, state_keys
+from tdanet_jax.scenes.room_names import Kinds, RoomKind
+from tdanet_jax.scenes.scene import SceneError
 from tdanet_jax.splits import make_split
 from tdanet_jax.vocabulary import ALL_TARGETS, TARGETS
 from tests.support import original, toy
@@ -52,7 +57,7 @@ def assert_equal(ours: SceneTables, theirs: SceneTables) -> None:
 
 def test_export_and_import_are_the_identity(some_rooms: SceneTables, tmp_path: Path) -> None:
     rooms = some_rooms.subset(["FloorPlan29", "FloorPlan321", "FloorPlan428"])
-    exporter.write_folder(rooms, tmp_path / "out", silent)
+    rooms = exporter.write_folder(rooms, tmp_path / "out", silent).tables
     back = importer.read_folder(tmp_path / "out", silent).tables
     assert_equal(rooms, back)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(rooms.scenes)
@@ -206,6 +211,25 @@ def test_broken_features_leave_nothing_behind(some_rooms: SceneTables, tmp_path:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out"]
 
 
+def test_the_links_have_the_names_of_older_and_newer_networkx(some_rooms: SceneTables) -> None:
+    room = some_rooms.subset(["FloorPlan428"])
+    graph = exporter.graph(room, state_keys(room.position))
+    assert len(graph["links"]) > room.num_states
+    assert graph["links"] == graph["edges"]
+
+
+@pytest.mark.parametrize("name", ["../../escaped", "/absolute", "a/b", "..", "a\nb"])
+def test_nothing_is_written_outside_of_the_folder(
+    some_rooms: SceneTables, tmp_path: Path, name: str
+) -> None:
+    room = dataclasses.replace(some_rooms.subset(["FloorPlan428"]), scenes=(name,))
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(SceneError, match="room name"):
+        exporter.write_folder(room, tmp_path / "a" / "b" / "out", silent)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_parents_survive_export_and_import(ithor: SceneTables) -> None:
     split = make_split("22/0")
     train = ithor.subset(split.train_scenes)
@@ -225,11 +249,11 @@ def test_an_import_interrupted_while_reading_continues(
     read: list[str] = []
     plain = reader.read_scene
 
-    def counted(folder: Path, name: str, room_type: int) -> reader.SceneData:
+    def counted(folder: Path, name: str, *rest: Any) -> reader.SceneData:
         read.append(name)
         if len(read) == 2:
             raise KeyboardInterrupt
-        return plain(folder, name, room_type)
+        return plain(folder, name, *rest)
 
     monkeypatch.setattr(importer, "read_scene", counted)
     with pytest.raises(KeyboardInterrupt):
@@ -249,24 +273,110 @@ def test_scenes_that_changed_are_read_again(
     monkeypatch.setattr(
         importer, "read_scene", lambda *given: (read.append(given[1]), plain(*given))[1]
     )
-    for times, change in (
-        (1, lambda: None),
-        (1, lambda: None),
-        (2, lambda: os.utime(place / "grid.json", (1, 1))),
-        (3, lambda: (parts / "FloorPlan1.npz").write_bytes(b"damaged")),
+    scene = SceneFolder("FloorPlan1", RoomKind(0, None), place)
+    bathroom = scene._replace(kind=RoomKind(3, None))
+    for times, change, folder, frame in (
+        (1, lambda: None, scene, None),
+        (1, lambda: None, scene, None),
+        (2, lambda: os.utime(place / "grid.json", (1, 1)), scene, None),
+        (3, lambda: (parts / "FloorPlan1.npz").write_bytes(b"damaged"), scene, None),
+        (4, lambda: None, scene, Frame(600, 600)),
+        (5, lambda: None, bathroom, Frame(600, 600)),
+        (6, lambda: (place / "images.hdf5").write_bytes(b"damaged"), bathroom, Frame(600, 600)),
     ):
         change()
-        room, _ = importer._read_cached(parts, place, "FloorPlan1", 0)
+        room, _ = importer._read_cached(parts, folder, frame)
         assert len(read) == times
         assert len(room.row_object) == 6
+        assert room.room_type.tolist() == [folder.kind.room_type]
+
+
+def copies(tmp_path: Path, *names: str) -> Path:
+    """A folder with the miniature's room under other names."""
+    for name in names:
+        original.write_room(tmp_path / "rooms" / name)
+    return tmp_path / "rooms"
+
+
+def test_rooms_of_any_name(tmp_path: Path) -> None:
+    """Type and part by name, by table, or for all the rest."""
+    names = ("FloorPlan2-10", "FloorPlan2-2", "FloorPlan30-1", "FloorPlan_Train1_1", "Lab [bold]",
+             "FloorPlan430", "FloorPlan5_physics")  # fmt: skip
+    source = copies(tmp_path, *names, "a\nb", "x" * 201)
+    (source / "FloorPlan6-1").mkdir()
+    (source / "thor_glove").mkdir()
+    lines: list[str] = []
+    back = importer.read_folder(source, lambda share, line: lines.append(line))
+    assert back.tables.scenes == (
+        "FloorPlan2-2", "FloorPlan2-10", "FloorPlan5", "FloorPlan30-1", "FloorPlan430"
+    )  # fmt: skip
+    assert back.extras is not None
+    assert back.extras.parts == {
+        "FloorPlan2-2": "train", "FloorPlan2-10": "train", "FloorPlan30-1": "test"
+    }  # fmt: skip
+    split = dataset.assign_rooms(make_split("22/0"), back)
+    assert {"FloorPlan2-2", "FloorPlan2-10", "FloorPlan5"} <= set(split.train_scenes)
+    assert {"FloorPlan30-1", "FloorPlan430"} <= set(split.eval_scenes)
+    assert lines[5:] == [
+        "FloorPlan6-1: left out, has no grid.json",
+        "FloorPlan_Train1_1: left out, --room-type or --rooms must say its type",
+        "Lab [bold]: left out, --room-type or --rooms must say its type",
+        "left out: room name 'a?b': has a control character",
+        f"left out: room name '{'x' * 40}': empty, longer than 200 bytes, or with a space at its "
+        "start or end",
+    ]
+
+    table = {"Lab [bold]": RoomKind(2, "test"), "FloorPlan30-1": RoomKind(1, None),
+             "Nowhere": RoomKind(0, None)}  # fmt: skip
+    kinds = Kinds(table, RoomKind(1, "train"))
+    back = importer.read_folder(source, lambda share, line: lines.append(line), kinds)
+    assert dict(zip(back.tables.scenes, back.tables.room_type.tolist(), strict=True)) == {
+        "FloorPlan2-2": 0, "FloorPlan2-10": 0, "FloorPlan5": 0, "FloorPlan_Train1_1": 1,
+        "FloorPlan30-1": 1, "Lab [bold]": 2, "FloorPlan430": 3,
+    }  # fmt: skip
+    assert back.extras is not None
+    assert back.extras.parts == {
+        "FloorPlan2-2": "train", "FloorPlan2-10": "train", "FloorPlan_Train1_1": "train",
+        "Lab [bold]": "test",
+    }  # fmt: skip
+    assert "1 rooms of the table of rooms are not in the folder: Nowhere" in lines
+    dataset.save_rooms(back, tmp_path / "rooms.npz")
+    again = dataset.load_rooms(tmp_path / "rooms.npz")
+    exporter.write_folder(again.tables, tmp_path / "out", silent)
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(again.tables.scenes)
+
+
+def test_boxes_that_never_come_near_the_border(tmp_path: Path) -> None:
+    source = copies(tmp_path, "FloorPlan1", "FloorPlan2")
+    with pytest.warns(UserWarning, match=r"in FloorPlan1, FloorPlan2; if the frames were smaller, "
+                                         r"import with --frame-size WIDTHxHEIGHT$"):  # fmt: skip
+        importer.read_folder(source, silent)
+    for name in ("FloorPlan1", "FloorPlan2"):
+        path = source / name / "objects_bb.json"
+        content = json.loads(path.read_text())
+        content[original.KEYS[0]] = {"Mug": [0, 0, 271, 271]}
+        path.write_text(json.dumps(content))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        importer.read_folder(source, silent)
+    with pytest.warns(UserWarning, match="no box comes near"):
+        importer.read_folder(source, silent, None, Frame(600, 300))
+    for name in ("FloorPlan1", "FloorPlan2"):
+        (source / name / "objects_bb.json").unlink()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        importer.read_folder(source, silent)
 
 
 def test_folders_without_scenes(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match="no folders FloorPlan1 to FloorPlan430"):
+    with pytest.raises(FileError, match="no folders of rooms"):
         layout.find_root(tmp_path / "nowhere")
     (tmp_path / "FloorPlan501").mkdir()
-    with pytest.raises(FileError, match="no folders FloorPlan1 to FloorPlan430"):
+    with pytest.raises(FileError, match="no folders of rooms"):
         layout.find_root(tmp_path)
+    original.write_room(tmp_path / "a" / "Lab")
+    with pytest.raises(FileError, match="no room to import; Lab: left out, --room-type or --rooms"):
+        layout.find_scenes(layout.find_root(tmp_path))
     (tmp_path / "FloorPlan1").mkdir()
     (tmp_path / "FloorPlan1_physics").mkdir()
     with pytest.raises(FileError, match="FloorPlan1 is there twice"):
@@ -276,6 +386,6 @@ def test_folders_without_scenes(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_all_rooms_survive_export_and_import(ithor: SceneTables, tmp_path: Path) -> None:
     """To the last bit: the hash over all fields is the same."""
-    exporter.write_folder(ithor, tmp_path / "out", silent)
+    written = exporter.write_folder(ithor, tmp_path / "out", silent).tables
     back = importer.read_folder(tmp_path / "out", silent).tables
-    assert back.data_version == ithor.data_version
+    assert back.data_version == written.data_version

@@ -1,0 +1,136 @@
+"""Names of rooms: which are allowed, and what they say about a room's type and part."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from tdanet_jax.io.untrusted import FileError
+from tdanet_jax.scenes.scene import SceneError
+from tdanet_jax.splits import PARTS, SCENE_NUMBERS, TRAIN_SCENES_PER_TYPE
+from tdanet_jax.vocabulary import ROOM_TYPES
+
+#: Bytes of UTF-8: names of rooms become names of files.
+LONGEST_NAME = 200
+COLUMNS = ("name", "room_type", "part")
+LARGEST_TABLE = 16 << 20  # bytes
+
+_ITHOR = re.compile(r"FloorPlan([1-9][0-9]{0,2})(?![0-9])")
+
+
+class RoomKind(NamedTuple):
+    """What kind of room a room is."""
+
+    room_type: int  # index into vocabulary.ROOM_TYPES
+    part: str | None  # "train" or "test" in every split; None: the split decides by the name
+
+
+def check_name(name: str) -> None:
+    """Accepts any name that is safe as the name of a file or folder and on a terminal.
+
+    Raises:
+      SceneError: the name is empty, too long, begins or ends with a space, is "." or "..", or has a
+        path separator (/, \\ or :) or a character that cannot be printed.
+    """
+    shown = "".join(c if c.isprintable() else "?" for c in name[:40])
+    if not name.isprintable():
+        raise SceneError(f"room name {shown!r}: has a control character")
+    if any(separator in name for separator in "/\\:") or name in (".", ".."):
+        raise SceneError(f"room name {shown!r}: is a path, not a plain name")
+    if not name or name != name.strip() or len(name.encode()) > LONGEST_NAME:
+        raise SceneError(
+            f"room name {shown!r}: empty, longer than {LONGEST_NAME} bytes, or with a space at "
+            "its start or end"
+        )
+
+
+def kind_of(name: str) -> RoomKind | None:
+    """The kind of a room whose name begins with that of an iTHOR room, otherwise None.
+
+    FloorPlan12-3 and FloorPlan12_b are kitchens and in the part of FloorPlan12, "train";
+    FloorPlan123 and FloorPlan_Train1_1 begin with no iTHOR room. The part of iTHOR's own names is
+    None: splits list these rooms by name, and `--validation` divides them further.
+    """
+    match = _ITHOR.match(name)
+    if match is None:
+        return None
+    number = int(match[1])
+    for room_type, room in enumerate(ROOM_TYPES):
+        if number in SCENE_NUMBERS[room]:
+            trains = SCENE_NUMBERS[room].index(number) < TRAIN_SCENES_PER_TYPE
+            part = PARTS[0] if trains else PARTS[1]
+            return RoomKind(room_type, None if match[0] == name else part)
+    return None
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """The kinds of rooms: by a table, otherwise by name, otherwise all the same.
+
+    Attributes:
+      table: from `read_table`.
+      other: the kind of rooms that are not in the table and whose name says nothing.
+    """
+
+    table: Mapping[str, RoomKind] = field(default_factory=dict)
+    other: RoomKind | None = None
+
+    def of(self, name: str) -> RoomKind | None:
+        """The kind of a room, or None if nothing says it."""
+        return self.table.get(name) or kind_of(name) or self.other
+
+
+def sort_key(name: str) -> tuple[tuple[bool, int, str], ...]:
+    """Sorts names with numbers by their numbers: FloorPlan2-1, FloorPlan2-10, FloorPlan10."""
+    return tuple(
+        (not part.isdecimal(), int(part) if part.isdecimal() else 0, part)
+        for part in re.split(r"([0-9]+)", name)
+    )
+
+
+def read_table(path: Path) -> dict[str, RoomKind]:
+    """Name -> kind of the rooms in a CSV file with the columns name, room_type and part.
+
+    The part may be empty, and its column missing: the room then belongs to neither part.
+
+    Raises:
+      FileError: it is not such a table; the message names line and column.
+    """
+    try:
+        if path.stat().st_size > LARGEST_TABLE:
+            raise FileError(path, f"larger than {LARGEST_TABLE >> 20} MiB")
+        # utf-8-sig: spreadsheets write a mark at the start.
+        rows = csv.reader(path.read_text(encoding="utf-8-sig").splitlines(), strict=True)
+        lines = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
+    except OSError as error:
+        raise FileError(path, error.strerror) from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FileError(path, f"not a CSV table ({error})") from None
+    header = lines[0][1] if lines else []
+    if len(set(header)) != len(header) or not {*COLUMNS[:2]} <= set(header) <= {*COLUMNS}:
+        raise FileError(path, f"line 1: the columns are not {', '.join(COLUMNS)}")
+    table: dict[str, RoomKind] = {}
+    for number, cells in lines[1:]:
+        if not any(cells):
+            continue
+        if len(cells) != len(header):
+            raise FileError(path, f"line {number}: {len(cells)} columns, not {len(header)}")
+        row = dict(zip(header, cells, strict=True))
+        try:
+            check_name(row["name"])
+        except SceneError as error:
+            raise FileError(path, f"line {number}: {error}") from None
+        if row["name"] in table:
+            raise FileError(path, f"line {number}: {row['name']} is listed twice")
+        if row["room_type"] not in ROOM_TYPES:
+            types = ", ".join(ROOM_TYPES)
+            raise FileError(path, f"line {number}: room_type {row['room_type']!r}, not {types}")
+        part = row.get("part") or None
+        if part not in (None, *PARTS):
+            raise FileError(path, f"line {number}: part {part!r}, not {' or '.join(PARTS)}")
+        table[row["name"]] = RoomKind(ROOM_TYPES.index(row["room_type"]), part)
+    return table
