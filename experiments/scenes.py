@@ -31,7 +31,7 @@ from experiments.console import (
     reporter,
 )
 from tdanet_jax.io import files
-from tdanet_jax.poses import GRID_SIZE, VIEWS
+from tdanet_jax.poses import ITHOR
 from tdanet_jax.splits import make_split
 from tdanet_jax.vocabulary import ALL_TARGETS, FIELD_OF_VIEW, IMAGE_SIZE, ROOM_TYPES
 
@@ -79,7 +79,7 @@ class Verify:
         start = time.monotonic()
         rooms = ithor.load_scenes()
         check_at_most("rooms", self.rooms, len(rooms))
-        check_at_most("views", self.views, min(len(room.points) for room in rooms) * VIEWS)
+        check_at_most("views", self.views, min(len(room.points) for room in rooms) * ITHOR.views)
         train = set(make_split("22/0").train_scenes)
         parts = {
             "train": [room for room in rooms if room.name in train],
@@ -311,7 +311,7 @@ def _start_ai2thor() -> Any:
     except ImportError:
         fail("collect needs AI2-THOR: pip install ai2thor")
     return controller.Controller(
-        gridSize=GRID_SIZE, width=IMAGE_SIZE, height=IMAGE_SIZE, fieldOfView=FIELD_OF_VIEW
+        gridSize=ITHOR.grid_size, width=IMAGE_SIZE, height=IMAGE_SIZE, fieldOfView=FIELD_OF_VIEW
     )
 
 

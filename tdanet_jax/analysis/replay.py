@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax import poses
 from tdanet_jax.analysis import labels
 from tdanet_jax.analysis.trace import Trace
 from tdanet_jax.scenes import camera_view, floor_plan
@@ -88,15 +87,15 @@ def _plan(plan: FloorPlan, target: str, scale: float) -> dict[str, Any]:
 def _step(trace: Trace, tables: SceneTables, i: int) -> dict[str, Any]:
     """What the page shows before action i, or at the end, where there is no decision."""
     pose, last = int(trace.pose[i]), i == len(trace.actions)
-    parts = poses.split(pose)
+    parts = tables.grid.split(pose)
     x, _, z = tables.position[parts.position]
-    rotation, horizon = parts.degrees
+    rotation, horizon = tables.grid.degrees(parts)
     seen = camera_view.of_pose(tables, pose)
     weights = None if trace.attention is None or last else trace.attention[i]
     step: dict[str, Any] = {
         "place": [round(METRE * float(x)), round(-METRE * float(z))],
         "rotation": rotation,
-        "horizon": horizon,
+        "horizon": int(horizon),
         "boxes": [
             [name, *_rounded(IMAGE * box), bool(near)]
             for name, box, near in zip(*seen, strict=True)

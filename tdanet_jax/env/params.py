@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -79,7 +80,7 @@ def make_params(
         raster=jnp.asarray(tables.raster, jnp.int8) if spec.image is not None else None,
         features=None if features is None else features.maps,
         first_feature=None if features is None else jnp.asarray(features.first, jnp.int32),
-        spec=spec,
+        spec=dataclasses.replace(spec, grid=tables.grid),
         size_noise=size_noise,
         **{name: jnp.asarray(v, jnp.int32) for name, v in pool.items()},
     )

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from tdanet_jax import poses
 from tdanet_jax.io import assets
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
 from tdanet_jax.scenes.tables import SceneTables
@@ -47,7 +46,7 @@ def draw(
     """Draws episodes as training does: uniformly a scene, then a target in it, then a start.
 
     Targets are those of the room type that can be reached from somewhere in the scene; starts are
-    positions from which the target can be reached, with any of the eight rotations and horizon 0.
+    positions from which the target can be reached, with any rotation and horizon 0.
     """
     rng = np.random.default_rng(seed)
     index = {name: i for i, name in enumerate(tables.scenes)}
@@ -68,7 +67,7 @@ def draw(
             goal = found[rng.integers(len(found))]
             valid = positions[reachable[positions, goal]]
             position = valid[rng.integers(len(valid))]
-            starts.append(poses.join(position, rng.integers(poses.ROTATIONS)))
+            starts.append(tables.grid.look_level(position, rng.integers(tables.grid.rotations)))
             goals.append(goal)
     return Episodes(np.array(starts, np.int32), np.array(goals, np.int32))
 

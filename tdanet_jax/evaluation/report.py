@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 import tdanet_jax
-from tdanet_jax import poses
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.evaluation import paper
 from tdanet_jax.evaluation.episodes import Episodes
@@ -103,8 +102,8 @@ class Provenance:
 
 def columns(tables: SceneTables, episodes: Episodes, records: Records) -> Columns:
     """Records as named columns of length E, with names instead of indices."""
-    pose = poses.split(episodes.pose)
-    rotation, horizon = pose.degrees
+    pose = tables.grid.split(episodes.pose)
+    rotation, horizon = tables.grid.degrees(pose)
     scene = tables.position_scene[pose.position]
     return {
         "scene": np.array(tables.scenes)[scene],

@@ -28,8 +28,8 @@ class PublishedEpisode:
     scene: str
     x: float  # metres
     z: float
-    rotation: int  # degrees clockwise from +z, a multiple of 45
-    horizon: int  # 0 or 30 degrees down
+    rotation: int  # degrees clockwise from +z
+    horizon: int  # degrees down
     target: str
 
 
@@ -141,8 +141,8 @@ def _find_problem(tables: SceneTables) -> str | None:
     sizes = {
         "R": len(tables.scenes), "P": len(tables.position), "O": len(tables.object_id),
         "N": len(tables.row_object), "S": tables.num_states, "S + 1": tables.num_states + 1,
-        "G": len(tables.targets), "C": len(tables.classes), "T": len(ROOM_TYPES),
-        "F": tables.image * tables.subpixel + 1,
+        "A": tables.grid.rotations, "G": len(tables.targets), "C": len(tables.classes),
+        "T": len(ROOM_TYPES), "F": tables.image * tables.subpixel + 1,
     }  # fmt: skip
     for names in (tables.scenes, tables.classes, tables.targets, tables.object_id):
         if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tdanet_jax.poses import ITHOR, PoseGrid
+
 MOST_CLASSES = 127  # in all rooms together: the raster stores a class as int8
 SUBPIXEL = 16  # boxes are stored in sixteenths of a pixel
 CAMERA_ABOVE_AGENT = 0.675  # metres from the agent's y to its camera, AI2-THOR's default agent
@@ -46,3 +48,4 @@ class Scene:
     default_position: np.ndarray | None = None  # [3] float64, agent in the metadata's frame
     default_rotation: int | None = None  # degrees clockwise from +z, horizon 0
     part: str | None = None  # "train" or "test" in every split; None if the name decides
+    grid: PoseGrid = ITHOR

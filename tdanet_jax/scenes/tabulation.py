@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax.poses import VIEWS
 from tdanet_jax.scenes.scene import MOST_CLASSES, SUBPIXEL, Scene, SceneError
 from tdanet_jax.scenes.tables import FIELDS, SceneTables, row_offsets
 from tdanet_jax.scenes.visibility.build import Detections, detect
@@ -54,7 +53,8 @@ def build(
                 raise SceneError(
                     f"{scene.name}: {item.object_id}: class {item.object_class} is not known"
                 )
-        return tabulate(scene, next_positions(scene.points), detect(scene, rules), targets)
+        ahead = next_positions(scene.points, scene.grid)
+        return tabulate(scene, ahead, detect(scene, rules), targets)
 
     rooms = []
     with ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, MOST_WORKERS)) as pool:
@@ -71,12 +71,12 @@ def tabulate(
     """The tables of one room, with its own classes.
 
     Args:
-      next_position: [P, 8] int32, the position after MoveAhead along each heading.
+      next_position: [P, rotations] int32, the position after MoveAhead along each heading.
     """
     classes = sorted({item.object_class for item in scene.objects})
     object_class = np.array([classes.index(o.object_class) for o in scene.objects], np.int16)
     row_class = object_class[detections.owner]
-    states = len(scene.points) * VIEWS
+    states = len(scene.points) * scene.grid.views
     goals = np.zeros((states, len(targets)), bool)
     for g, target in enumerate(targets):
         if target in classes:
@@ -98,8 +98,9 @@ def tabulate(
         object_class=object_class,
         object_scene=np.zeros(len(scene.objects), np.int16),
         object_box=np.array([item.box.reshape(6) for item in scene.objects]),
-        distance=action_distances(transitions(next_position), goals),
+        distance=action_distances(transitions(next_position, scene.grid), goals),
         raster=paint(detections.state, detections.box, row_class, states, IMAGE_SIZE * SUBPIXEL),
+        grid=scene.grid,
     )
 
 

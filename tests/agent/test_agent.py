@@ -253,7 +253,7 @@ def test_an_agent_with_sensors_must_be_told_whether_its_move_was_blocked(odometr
 def test_odometry_knows_of_a_start_that_looks_down(odometry_agent):
     assert int(odometry_agent.start(horizon=30).sensors["odometry"].horizon) == 1
     assert int(odometry_agent.start(45.0001, 0.0).sensors["odometry"].heading) == 1
-    with pytest.raises(ValueError, match="horizon 15: neither 0 nor 30"):
+    with pytest.raises(ValueError, match="horizon 15: not among 0, 30 degrees"):
         odometry_agent.start(horizon=15)
 
 

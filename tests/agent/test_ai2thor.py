@@ -340,7 +340,7 @@ def test_an_episode_ends_after_a_hundred_actions(rooms):
 
 @pytest.mark.parametrize(
     ("rotation", "horizon", "message"),
-    [(30, 0, "rotation 30: not a multiple of 45"), (0, 60, "horizon 60: neither 0 nor 30 degrees")],
+    [(30, 0, "rotation 30: not a multiple of 45"), (0, 60, "horizon 60: not among 0, 30 degrees")],
 )
 def test_a_start_off_the_poses_is_refused(agent, rooms, rotation, horizon, message):
     simulator = StandIn(rooms, where(rooms, 0, True))

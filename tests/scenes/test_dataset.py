@@ -12,6 +12,7 @@ import pytest
 
 from tdanet_jax.io import archive
 from tdanet_jax.io.untrusted import FileError
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneTables, dataset, tabulation
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode, Rooms
 from tdanet_jax.splits import make_split
@@ -120,6 +121,35 @@ def test_rooms_with_a_part_of_their_own() -> None:
     assert found[True] == ({"FloorPlan1"} | own - {"Own4"}, {"Den", "Own4"})
     split = make_split("18/4")
     assert dataset.assign_rooms(split, Rooms(rooms.tables, None)) == split
+
+
+def test_a_grid_of_its_own_is_kept(rooms: SceneTables, tmp_path: Path) -> None:
+    """And tables without one are as before there were such grids, hash included."""
+    assert b"grid" not in rooms.to_arrays()["rest"].tobytes()
+    grid = PoseGrid(0.5, 4, (-30, 0))
+    scene = dataclasses.replace(toy.corridor(), points=toy.line(5) * (1, 1, 2), grid=grid)
+    tables = tabulation.build([scene])
+    assert tables.num_states == 5 * 8
+    path = tmp_path / "rooms.npz"
+    dataset.save_rooms(Rooms(tables, None), path)
+    found = dataset.load_rooms(path).tables
+    assert found.grid == grid
+    assert found.data_version == tables.data_version
+    assert found.as_scene().grid == grid
+    assert dataclasses.replace(tables, grid=PoseGrid(0.4, 4, (-30, 0))).data_version != (
+        tables.data_version
+    )
+    for broken in (PoseGrid(0.5, 8, (0,)), PoseGrid(0.5, 4, (-30, 0, 30))):
+        dataset.save_rooms(Rooms(dataclasses.replace(tables, grid=broken), None), path)
+        with pytest.raises(FileError, match="not a file of rooms"):
+            dataset.load_rooms(path)
+    arrays = tables.to_arrays()
+    rest = json.loads(arrays["rest"].tobytes())
+    rest["grid"]["rotations"] = 7
+    arrays["rest"] = np.frombuffer(json.dumps(rest).encode(), np.uint8)
+    archive.write(path, arrays)
+    with pytest.raises(FileError, match="not a file of rooms .7 rotations"):
+        dataset.load_rooms(path)
 
 
 def test_other_archives(rooms: SceneTables, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneError, metadata
 
 BOX = {"center": {"x": 0.0, "y": 1.5, "z": 1.0}, "size": {"x": 0.2, "y": 0.2, "z": 0.2}}
@@ -78,6 +79,22 @@ def test_a_room_may_say_what_it_is_for(tmp_path: Path) -> None:
     assert [scene.part for scene in read(tmp_path, {**DOCUMENT, "split": "test"})] == ["test"]
 
 
+def test_a_room_may_have_a_grid_of_its_own(tmp_path: Path) -> None:
+    """Under which turns of 20 degrees are a default frame where they are possible."""
+    assert read(tmp_path, DOCUMENT)[0].grid == PoseGrid()
+    fields = {"gridSize": 0.125, "rotateStepDegrees": 30.0, "horizons": [-30, 0, 30]}
+    document = {**DOCUMENT, **fields}
+    document["agent"] = {**DOCUMENT["agent"], "rotation": {"x": 0, "y": 150.5, "z": 0}}
+    [scene] = read(tmp_path, document)
+    assert scene.grid == PoseGrid(0.125, 12, (-30, 0, 30))
+    assert scene.default_rotation == 150
+    assert len(scene.points) == 3
+    other = {**DOCUMENT, **fields, "name": "Den"}
+    with pytest.raises(SceneError, match=r"scenes.json: Den: another gridSize, .* than Lab;"):
+        read(tmp_path, [DOCUMENT, other])
+    assert len(read(tmp_path, [document, other])) == 2
+
+
 @pytest.mark.parametrize(("horizon", "turn"), [(30.0, 0.0), (0.0, 20.0)])
 def test_odd_poses_are_not_default_frames(tmp_path: Path, horizon: float, turn: float) -> None:
     document = copy.deepcopy(DOCUMENT)
@@ -119,6 +136,13 @@ CASES = [
     (["name"], None, "a scene without a name"),
     (["split"], "half", "Lab: split 'half', not train or test"),
     (["split"], ["test"], "Lab: split "),
+    (["gridSize"], 0.4, "Lab: reachable position x .*: off the 0.4 m grid"),
+    (["gridSize"], "wide", "Lab: gridSize wide: must be from 0.05 to 0.5 metres"),
+    (["rotateStepDegrees"], 40, r"Lab: rotateStepDegrees 40, not one of \[15, 30, 45, 60, 90\]"),
+    (["rotateStepDegrees"], "90", "Lab: rotateStepDegrees '90', not one of"),
+    (["horizons"], 30, "Lab: horizons is not a list"),
+    (["horizons"], [], r"Lab: horizons \[\]: must be whole degrees"),
+    (["horizons"], [0, [30]], "Lab: horizons .*: must be whole degrees"),
     (["agent"], 3, "Lab: agent"),
     (["agent", "position"], None, "Lab: agent"),
     (["agent", "cameraHorizon"], "level", "Lab: agent"),

@@ -38,7 +38,7 @@ def test_states_of_poses() -> None:
     assert t.nearest_state(0, 9.0, 9.0, -45) == (4 * 8 + 7) * 2
     assert t.nearest_state(1, 9.0, 0.0, 360) == 5 * 16
     for rotation, horizon in ((20, 0), (0, 45)):
-        with pytest.raises(SceneError):
+        with pytest.raises(ValueError, match=r"not a multiple of 45|not among 0, 30"):
             t.nearest_state(0, 0, 0, rotation, horizon)
 
 

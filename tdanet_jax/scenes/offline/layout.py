@@ -87,7 +87,7 @@ def state_key(x: float, z: float, rotation: int, horizon: int) -> str:
 def state_keys(points: np.ndarray) -> list[str]:
     """Keys of all P * 16 states at points [P, 3], in the order of the tables."""
     return [
-        state_key(float(x), float(z), *poses.split(view).degrees)
+        state_key(float(x), float(z), *poses.ITHOR.degrees(poses.split(view)))
         for x, _, z in points
         for view in range(poses.VIEWS)
     ]
