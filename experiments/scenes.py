@@ -15,7 +15,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -103,9 +103,9 @@ class Inspect:
     position: tuple[float, float] | None = None
     """x and z in metres, at the nearest reachable point. By default, a view of many objects."""
     rotation: int = 0
-    """Degrees clockwise from +z, a multiple of 45; requires --position."""
+    """Degrees clockwise from +z, in iTHOR a multiple of 45; requires --position."""
     horizon: int = 0
-    """0 or 30 degrees down; requires --position."""
+    """Degrees down, in iTHOR 0 or 30; requires --position."""
     scenes: Path | None = None
     """Scene file (JSON) with the room; by default the bundled rooms."""
     data: str | None = None
@@ -164,6 +164,14 @@ class Import:
 
     scenes: tyro.conf.Positional[Path | None] = None
     """Scene file."""
+    room_type: str | None = None
+    """Type of the rooms for which neither the scene file nor --rooms says it, unless they have
+    iTHOR's names: kitchen, living_room, bedroom, bathroom, or one of your own, such as office."""
+    part: Literal["train", "test"] | None = None
+    """Likewise the part of every split that they belong to."""
+    rooms: Path | None = None
+    """Table with the columns name,room_type,part (CSV): what the scene file does not say of rooms.
+    Cells may be empty."""
     source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """Folder with the folders FloorPlan*; files next to them (parents, class graph, test episodes)
     are imported as well. An interrupted import continues where it stopped."""
@@ -183,6 +191,8 @@ class Import:
             fail("import needs a scene file, or --from a folder of FloorPlan*, and not both")
         if self.features and self.source is None:
             fail("--features: needs --from")
+        if self.source is not None and (self.room_type, self.part, self.rooms) != (None,) * 3:
+            fail("--room-type, --part and --rooms: only with a scene file")
         check_new_file(self.out)
         maps, maps_out = None, features.features_path(self.out)
         if self.features and self.source is not None:
@@ -205,12 +215,16 @@ class Import:
     def _rooms(self) -> dataset.Rooms:
         """The rooms of the source, before anything is written."""
         from tdanet_jax.scenes import dataset
+        from tdanet_jax.scenes.labels import Label, Labels, check_label, read_table
         from tdanet_jax.scenes.offline import importer
 
         if self.scenes is not None:
+            others = Label(self.room_type, self.part)
+            check_label(others)
+            labels = Labels(read_table(self.rooms) if self.rooms else {}, others)
             with reporter("rooms") as report:
                 return dataset.build_rooms(
-                    self.scenes, lambda done, total: report(done / total, "rebuilt")
+                    self.scenes, lambda done, total: report(done / total, "rebuilt"), labels
                 )
         assert self.source is not None
         with reporter("import") as report:
@@ -265,6 +279,7 @@ class Export:
         parents = extras.parents if extras and extras.parents else named_parents(tables)
         if self.scenes:
             tables = tables.subset(self.scenes)
+        exporter.check_layout(tables)
         vectors = None
         if self.vectors:
             vectors = words.load_word_vectors(self.word_vectors, tables.classes).table(
@@ -287,6 +302,7 @@ class Collect:
     def run(self) -> None:
         """Starts AI2-THOR, visits the rooms, writes the file."""
         from tdanet_jax.scenes import collect
+        from tdanet_jax.scenes.labels import Label, check_label
 
         check_new_file(self.out)
         if not self.scenes:
@@ -294,8 +310,9 @@ class Collect:
         rooms = []
         for word in self.scenes:
             name, _, kind = word.rpartition("=")
-            if not name or kind not in ROOM_TYPES:
-                fail(f"{word}: not NAME=TYPE with a type of {', '.join(ROOM_TYPES)}")
+            if not name or not kind:
+                fail(f"{word}: not NAME=TYPE, with a type such as {', '.join(ROOM_TYPES)}")
+            check_label(Label(kind))
             rooms.append((name, kind))
         controller = _start_ai2thor()
         try:

@@ -21,6 +21,8 @@ TURNS = (15, 30, 45, 60, 90)
 #: The distances of neighbouring points, in metres. Farther apart, there would be walls between
 #: them (`visibility.rules.Rules.void`).
 SIZES = (0.05, 0.5)
+#: Degrees by which a simulator may miss a rotation or a horizon.
+TOLERANCE = 0.1
 
 #: A whole number, or an array of them, of NumPy or of JAX.
 Integers = Any
@@ -120,17 +122,24 @@ class PoseGrid:
         return self.join(position, rotation, self.level)
 
     def from_degrees(self, position: Integers, rotation: int, horizon: int) -> Integers:
-        """Poses from a position, and degrees that have passed `check_degrees`."""
+        """Poses from a position, and degrees that are exactly those of a pose."""
         turns = rotation // self.turn % self.rotations
         return self.join(position, turns, self.horizons.index(horizon))
 
-    def check_degrees(self, rotation: float, horizon: float) -> None:
-        """Raises ValueError, with one line, unless these are degrees of a pose."""
-        if rotation % self.turn:
+    def nearest_view(self, rotation: float, horizon: float) -> tuple[int, int]:
+        """Rotation and horizon, as a pose has them, from a user's or a simulator's degrees.
+
+        Raises:
+          ValueError: there is none within a tenth of a degree.
+        """
+        turns = round(rotation / self.turn)
+        if abs(rotation - self.turn * turns) > TOLERANCE:
             raise ValueError(f"rotation {rotation}: not a multiple of {self.turn} degrees")
-        if horizon not in self.horizons:
+        look = min(self.horizons, key=lambda degrees: abs(degrees - horizon))
+        if not abs(horizon - look) <= TOLERANCE:  # so that NaN is refused, too
             known = ", ".join(map(str, self.horizons))
             raise ValueError(f"horizon {horizon}: not among {known} degrees")
+        return turns % self.rotations, self.horizons.index(look)
 
     def degrees(self, pose: Pose) -> tuple[Integers, Integers]:
         """Rotation and horizon of the parts of poses, in degrees."""

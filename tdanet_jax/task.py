@@ -14,7 +14,7 @@ from tdanet_jax import words as word_vectors
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.env import reward, zero_shot
 from tdanet_jax.env.environment import Environment
-from tdanet_jax.env.params import TEST_STEP_LIMITS, FeatureMaps, make_params
+from tdanet_jax.env.params import FeatureMaps, limits_of_tests, make_params
 from tdanet_jax.env.reward import Parents
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.models import class_graph
@@ -28,7 +28,6 @@ from tdanet_jax.scenes.offline.features import features_path, load_features
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.splits import Split, make_split
-from tdanet_jax.vocabulary import ROOM_TYPES
 from tdanet_jax.words import WordVectors
 
 
@@ -202,7 +201,7 @@ def make_task(
             seen_rooms,
             split.seen,
             parents if rewarded == "parents" else reward.no_parents(seen_rooms),
-            [config.learner.step_limit] * len(ROOM_TYPES),
+            [config.learner.step_limit] * len(tables.room_types),
             model.spec,
             similarity=similarity,
             features=train_maps,
@@ -210,9 +209,9 @@ def make_task(
         ),
         eval_params=make_params(
             tables,
-            {room: split.seen[room] + split.unseen[room] for room in ROOM_TYPES},
+            {room: split.seen[room] + split.unseen[room] for room in split.seen},
             parents,
-            TEST_STEP_LIMITS,
+            limits_of_tests(tables),
             model.spec,
             features=eval_maps,
             scenes=split.eval_scenes,

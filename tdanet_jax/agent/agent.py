@@ -35,8 +35,6 @@ from tdanet_jax.words import WordVectors
 
 #: Rows and labels are padded to multiples of these, so that few shapes are ever compiled.
 ROW_BLOCK, LABEL_BLOCK = 16, 64
-#: Degrees by which a simulator may miss a rotation or a horizon.
-TOLERANCE = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +113,7 @@ class Agent:
         Raises:
           ValueError: the grid has no such rotation or horizon.
         """
-        turn, down = self.nearest_view(rotation, horizon)
+        turn, down = self.grid.nearest_view(rotation, horizon)
         start = Start(jnp.int32(turn), jnp.int32(down))
         return AgentState(
             recurrent=actor_critic.initial_state(self.model, self.weights, 1),
@@ -123,22 +121,6 @@ class Agent:
             sensors=suite.init(self.spec, start),
             target=jnp.int32(-1),
         )
-
-    def nearest_view(self, rotation: float, horizon: float) -> tuple[int, int]:
-        """Indices of a rotation and a horizon that a simulator reports in degrees.
-
-        Raises:
-          ValueError: the grid has none within a tenth of a degree.
-        """
-        grid = self.grid
-        turned = grid.turn * round(rotation / grid.turn)
-        down = min(grid.horizons, key=lambda degrees: abs(degrees - horizon))
-        grid.check_degrees(
-            turned if abs(rotation - turned) <= TOLERANCE else rotation,
-            down if abs(horizon - down) <= TOLERANCE else horizon,
-        )
-        view = grid.split(grid.from_degrees(0, turned, down))
-        return view.rotation, view.horizon
 
     def act(
         self,

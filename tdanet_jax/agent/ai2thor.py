@@ -172,7 +172,7 @@ def play(
     places, decisions, unnamed = [_place(event)], [], set[str]()
     state = agent.start(places[0].rotation, places[0].horizon)
     # With its angles rounded, as Unity's are never exact.
-    view = agent.nearest_view(places[0].rotation, places[0].horizon)
+    view = agent.grid.nearest_view(places[0].rotation, places[0].horizon)
     rotation, horizon = agent.grid.turn * view[0], agent.grid.horizons[view[1]]
     expected, blocked = places[0]._replace(rotation=rotation, horizon=horizon), False
     for step in range(step_limit):

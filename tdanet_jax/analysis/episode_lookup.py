@@ -16,7 +16,7 @@ from tdanet_jax.evaluation import episodes
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.report import EPISODES_FILE
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
+from tdanet_jax.vocabulary import ACTION_NAMES
 
 #: How far from a start the nearest reachable point may be, in metres.
 FARTHEST_START = 0.5
@@ -61,7 +61,7 @@ def find(
             f"{target}: no target that can be seen in {scene}; there: {', '.join(found) or 'none'}"
         )
     if start is None:
-        room = ROOM_TYPES[tables.room_type[index]]
+        room = tables.room_types[tables.room_type[index]]
         return episodes.draw(tables, [scene], {room: [target]}, 1, seed)
     pose, goal = tables.nearest_state(index, *start), tables.targets.index(target)
     x, _, z = tables.position[tables.grid.split(pose).position]

@@ -14,7 +14,7 @@ from tdanet_jax.analysis.trace import Trace
 from tdanet_jax.scenes import camera_view, floor_plan
 from tdanet_jax.scenes.floor_plan import FloorPlan
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
+from tdanet_jax.vocabulary import ACTION_NAMES
 
 #: Where the template takes the episode.
 SLOT = "{{EPISODE}}"
@@ -34,7 +34,7 @@ def page(traces: Sequence[Trace], tables: SceneTables) -> str:
     if any((t.pose[0], t.target) != (first.pose[0], first.target) for t in traces):
         raise ValueError("the traces start in different places or look for different targets")
     plan = floor_plan.of_room(tables, first.scene)
-    room = ROOM_TYPES[tables.room_type[tables.scenes.index(first.scene)]]
+    room = tables.room_types[tables.room_type[tables.scenes.index(first.scene)]]
     episode = {
         "scene": first.scene,
         "room": room.replace("_", " "),

@@ -1,7 +1,7 @@
 """The data types of the environment.
 
-Axis letters: P positions, S poses, C classes, G targets, K detections, Q (scene, target)
-pairs, R scenes.
+Axis letters: P positions, S poses, C classes, T room types, G targets, K detections, Q (scene,
+target) pairs, R scenes.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class EnvParams(struct.PyTreeNode):
     target_class: jax.Array  # [G] int32, class of a target
     parent_class: jax.Array  # [G, 3] int32, -1 where a target has fewer parents
     parent_reward: jax.Array  # [G, 3] float32, R_p of the paper's Eq. 3
-    step_limit: jax.Array  # [4] int32, actions after which an episode is truncated, by room type
+    step_limit: jax.Array  # [T] int32, actions after which an episode is truncated, by room type
     room_pool: jax.Array  # [rooms] int32, room types that have an episode
-    room_scenes: jax.Array  # [4, 2] int32, first and number of the scenes of a room type
+    room_scenes: jax.Array  # [T, 2] int32, first and number of the scenes of a room type
     scene_pairs: jax.Array  # [R', 2] int32, first and number of a scene's (scene, target) pairs
     pair_target: jax.Array  # [Q] int32, the target of a pair
     pair_starts: jax.Array  # [Q, 2] int32, first and number of a pair's start positions

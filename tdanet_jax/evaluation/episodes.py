@@ -12,7 +12,6 @@ from tdanet_jax.io import assets
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.splits import GROUPS, UNSEEN, Split, make_split
-from tdanet_jax.vocabulary import ROOM_TYPES
 
 ASSET = "episodes.npz"
 EPISODES_PER_ROOM_TYPE = 250
@@ -52,10 +51,10 @@ def draw(
     index = {name: i for i, name in enumerate(tables.scenes)}
     reachable = tables.reachable
     starts, goals = [], []
-    for room in ROOM_TYPES:
+    for kind, room in enumerate(tables.room_types):
         options = []
         for scene in scenes:
-            if ROOM_TYPES[tables.room_type[index[scene]]] != room:
+            if tables.room_type[index[scene]] != kind:
                 continue
             positions = np.flatnonzero(tables.position_scene == index[scene])
             found = [tables.targets.index(name) for name in targets.get(room, ())]
@@ -132,7 +131,7 @@ def published(
             scene = scenes.get(episode.scene)
             if scene is None or episode.part != "test":
                 continue
-            if episode.target not in targets.get(ROOM_TYPES[tables.room_type[scene]], ()):
+            if episode.target not in targets.get(tables.room_types[tables.room_type[scene]], ()):
                 continue
             goal = tables.targets.index(episode.target)
             pose = tables.nearest_state(

@@ -3,14 +3,15 @@
 A scene file is JSON: a scene or a list of scenes, each an object with
 
     name                 unique in the file
-    room_type            kitchen, living_room, bedroom or bathroom
+    room_type            kitchen, living_room, bedroom, bathroom, or a type of one's own; the flags
+                         of `import` may say it instead, or the name, if it is that of an iTHOR room
     objects              controller.last_event.metadata["objects"]
     reachable_positions  the actionReturn of GetReachablePositions
     gridSize             optional, metres between neighbouring positions, 0.25 by default
     rotateStepDegrees    optional, degrees that a turn measures, 45 by default
     horizons             optional, degrees that the camera can look down, [0, 30] by default
     split                optional, train or test: the part of every split that the room belongs to;
-                         without it the name decides, if it is the name of an iTHOR room
+                         without it the flags of `import` decide, or the name
     agent                optional, metadata["agent"] in the same frame, to verify the flags
 
 The grid, that is gridSize, rotateStepDegrees and horizons, is the same for all scenes of a file.
@@ -33,9 +34,9 @@ from typing import Any
 import numpy as np
 
 from tdanet_jax.poses import ITHOR, TURNS, PoseGrid
-from tdanet_jax.scenes.scene import Scene, SceneError, SceneObject
-from tdanet_jax.splits import PARTS
-from tdanet_jax.vocabulary import IGNORED, ROOM_TYPES
+from tdanet_jax.scenes.labels import Label, Labels, check_label
+from tdanet_jax.scenes.scene import Scene, SceneError, SceneObject, check_name
+from tdanet_jax.vocabulary import IGNORED
 
 ALIGNED = 0.02  # metres by which a point may miss the grid
 FARTHEST = 1000.0  # metres from the origin; a coordinate beyond this is an error
@@ -43,7 +44,7 @@ FARTHEST = 1000.0  # metres from the origin; a coordinate beyond this is an erro
 
 def parse_scene(
     name: str,
-    room_type: int,
+    room_type: str,
     records: Sequence[Mapping[str, Any]],
     points: np.ndarray,
     default_position: np.ndarray | None = None,
@@ -160,8 +161,11 @@ def _corners(scene: str, name: str, oriented: Any) -> np.ndarray:
     return np.array(points, np.float64)
 
 
-def read_scenes(path: Path) -> list[Scene]:
+def read_scenes(path: Path, labels: Labels | None = None) -> list[Scene]:
     """The rooms of a scene file.
+
+    Args:
+      labels: room types and parts of the rooms for which the file does not say them.
 
     Raises:
       SceneError: it is not such a file, or a scene breaks a rule.
@@ -173,10 +177,13 @@ def read_scenes(path: Path) -> list[Scene]:
     documents = content if isinstance(content, list) else [content]
     if not documents:
         raise SceneError(f"{path}: no scenes")
-    scenes = [_read_scene(path, document) for document in documents]
+    labels = Labels() if labels is None else labels
+    scenes = [_read_scene(path, document, labels) for document in documents]
     name, times = Counter(scene.name for scene in scenes).most_common(1)[0]
     if times > 1:
         raise SceneError(f"{path}: {name}: name occurs {times} times")
+    if unknown := sorted(set(labels.rooms) - {scene.name for scene in scenes}):
+        raise SceneError(f"{path}: no room is called {unknown[0]}, which --rooms lists")
     for scene in scenes:
         if scene.grid != scenes[0].grid:
             raise SceneError(
@@ -186,17 +193,15 @@ def read_scenes(path: Path) -> list[Scene]:
     return scenes
 
 
-def _read_scene(path: Path, document: Any) -> Scene:
+def _read_scene(path: Path, document: Any, labels: Labels) -> Scene:
     if not isinstance(document, Mapping) or not isinstance(document.get("name"), str):
         raise SceneError(f"{path}: a scene without a name")
     name = document["name"]
-    if document.get("room_type") not in ROOM_TYPES:
-        raise SceneError(f"{name}: room_type {document.get('room_type')!r}, not {ROOM_TYPES}")
+    check_name(name, f"{path}: name")
+    room_type, part = _label(path, name, document, labels)
     for key in ("objects", "reachable_positions"):
         if not isinstance(document.get(key), list):
             raise SceneError(f"{name}: {key} is not a list")
-    if document.get("split") not in (None, *PARTS):
-        raise SceneError(f"{name}: split {document['split']!r}, not {' or '.join(PARTS)}")
     points = [
         _vector(name, f"reachable_positions[{i}]", {"position": point}, "position")
         for i, point in enumerate(document["reachable_positions"])
@@ -207,14 +212,32 @@ def _read_scene(path: Path, document: Any) -> Scene:
         position, rotation = _agent(name, document["agent"], grid)
     scene = parse_scene(
         name,
-        ROOM_TYPES.index(document["room_type"]),
+        room_type,
         document["objects"],
         np.reshape(points, (-1, 3)),
         position,
         rotation,
         grid,
     )
-    return dataclasses.replace(scene, part=document.get("split"))
+    return dataclasses.replace(scene, part=part)
+
+
+def _label(
+    path: Path, name: str, document: Mapping[str, Any], labels: Labels
+) -> tuple[str, str | None]:
+    """Room type and part of a scene."""
+    said = Label(document.get("room_type"), document.get("split"))
+    try:
+        check_label(said)
+    except SceneError as error:
+        raise SceneError(f"{name}: {error}") from None
+    room_type, part = labels.complete(name, said)
+    if room_type is None:
+        raise SceneError(
+            f'{path}: {name}: no room type; give it in the file ("room_type"), or import the file '
+            "with --room-type or --rooms"
+        )
+    return room_type, part
 
 
 def _grid(scene: str, document: Mapping[str, Any]) -> PoseGrid:

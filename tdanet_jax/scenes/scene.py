@@ -9,6 +9,8 @@ import numpy as np
 from tdanet_jax.poses import ITHOR, PoseGrid
 
 MOST_CLASSES = 127  # in all rooms together: the raster stores a class as int8
+MOST_ROOM_TYPES = 127  # in all rooms together: the tables store a type as int8
+LONGEST_NAME = 200  # characters in the name of a room or a room type
 SUBPIXEL = 16  # boxes are stored in sixteenths of a pixel
 CAMERA_ABOVE_AGENT = 0.675  # metres from the agent's y to its camera, AI2-THOR's default agent
 
@@ -19,6 +21,14 @@ class SceneError(ValueError):
     def __init__(self, message: str) -> None:
         # Names come from files and may contain line breaks.
         super().__init__(" ".join(message.split()))
+
+
+def check_name(name: str, what: str = "name") -> None:
+    """Raises SceneError unless a room or a room type can have this name, and a file as well."""
+    if not name.strip() or len(name) > LONGEST_NAME:
+        raise SceneError(f"{what} {name[:20]!r}: must have from 1 to {LONGEST_NAME} characters")
+    if not name.isprintable() or not {"/", "\\"}.isdisjoint(name) or name in (".", ".."):
+        raise SceneError(f"{what} {name!r}: must have no path separator or control character")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +52,7 @@ class Scene:
     """A room: where an agent can stand, and the objects around it."""
 
     name: str
-    room_type: int  # index into vocabulary.ROOM_TYPES
+    room_type: str  # one of vocabulary.ROOM_TYPES, or a type of its own
     points: np.ndarray  # [P, 3] float64, reachable agent positions; metres
     objects: tuple[SceneObject, ...]  # sorted by (class, id)
     default_position: np.ndarray | None = None  # [3] float64, agent in the metadata's frame

@@ -20,7 +20,7 @@ from tdanet_jax.io import archive
 from tdanet_jax.io.untrusted import npz
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene, SceneError, SceneObject
-from tdanet_jax.vocabulary import FIELD_OF_VIEW, IMAGE_SIZE
+from tdanet_jax.vocabulary import FIELD_OF_VIEW, IMAGE_SIZE, ROOM_TYPES
 
 #: Field -> dtype, shape, least value, and the axis that its values are indices of. In addition to
 #: the axes above, T are the room types, A the rotations and F the units of `row_box` along the
@@ -41,7 +41,7 @@ FIELDS: dict[str, tuple[str, tuple[Any, ...], int, str]] = {
     "raster": ("int8", ("S", 7, 7), -1, "C"),
 }
 #: Fields that the first tables did not have.
-_LATER = {"grid"}
+_LATER = {"grid", "room_types"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class SceneTables:
     classes: tuple[str, ...]  # C names, sorted
     targets: tuple[str, ...]  # G names
     object_id: tuple[str, ...]  # O names, unique within a scene
-    room_type: np.ndarray  # [R] int8, index into vocabulary.ROOM_TYPES
+    room_type: np.ndarray  # [R] int8, index into `room_types`
     position: np.ndarray  # [P, 3] float64, agent's x, y, z in metres
     position_scene: np.ndarray  # [P] int16, nondecreasing
     next_position: np.ndarray  # [P, rotations] int32, where MoveAhead leads; itself when blocked
@@ -71,6 +71,7 @@ class SceneTables:
     image: int = IMAGE_SIZE  # pixels, width and height of the frame
     subpixel: int = SUBPIXEL  # units of row_box in a pixel
     grid: PoseGrid = ITHOR  # the poses at a position, and the steps between positions
+    room_types: tuple[str, ...] = ROOM_TYPES  # T names: iTHOR's four, then others, sorted
 
     @property
     def num_states(self) -> int:
@@ -111,11 +112,11 @@ class SceneTables:
         Raises:
           ValueError: the grid has no such rotation or horizon.
         """
-        self.grid.check_degrees(rotation, horizon)
+        view = self.grid.nearest_view(rotation, horizon)
         here = np.flatnonzero(self.position_scene == scene)
         offset = self.position[here][:, [0, 2]] - (x, z)
         position = int(here[(offset**2).sum(axis=1).argmin()])
-        return self.grid.from_degrees(position, rotation, horizon)
+        return self.grid.join(position, *view)
 
     @cached_property
     def data_version(self) -> str:
@@ -185,7 +186,13 @@ class SceneTables:
             SceneObject(name, self.classes[self.object_class[i]], box.reshape(2, 3))
             for i, (name, box) in enumerate(zip(self.object_id, self.object_box, strict=True))
         )
-        return Scene(self.scenes[0], int(self.room_type[0]), self.position, objects, grid=self.grid)
+        return Scene(
+            self.scenes[0],
+            self.room_types[self.room_type[0]],
+            self.position,
+            objects,
+            grid=self.grid,
+        )
 
     def save(self, path: Path) -> None:
         """Writes the tables as a compressed npz without pickles."""

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
-from tdanet_jax.scenes.scene import MOST_CLASSES, SUBPIXEL, Scene, SceneError
+from tdanet_jax.scenes.scene import MOST_CLASSES, MOST_ROOM_TYPES, SUBPIXEL, Scene, SceneError
 from tdanet_jax.scenes.tables import FIELDS, SceneTables, row_offsets
 from tdanet_jax.scenes.visibility.build import Detections, detect
 from tdanet_jax.scenes.visibility.geometry import action_distances, next_positions, transitions
 from tdanet_jax.scenes.visibility.rules import RULES, Rules
-from tdanet_jax.vocabulary import ALL_TARGETS, IMAGE_SIZE
+from tdanet_jax.vocabulary import ALL_TARGETS, IMAGE_SIZE, ROOM_TYPES
 
 #: Rooms that are computed at once, given as many cores: 2 GB of memory.
 MOST_WORKERS = 8
@@ -39,13 +39,16 @@ def build(
       classes: the vocabulary; by default the classes that occur, sorted.
 
     Raises:
-      SceneError: there are more classes than the raster can number, or `classes` lacks one.
+      SceneError: there are more classes or room types than the tables can number, or `classes`
+        lacks one.
     """
     if classes is None:
         classes = sorted({item.object_class for scene in scenes for item in scene.objects})
     names = tuple(classes)
     if len(names) > MOST_CLASSES:
         raise SceneError(f"{len(names)} classes, more than {MOST_CLASSES}")
+    if len(_room_types(scene.room_type for scene in scenes)) > MOST_ROOM_TYPES:
+        raise SceneError(f"more than {MOST_ROOM_TYPES} room types")
 
     def build_room(scene: Scene) -> SceneTables:
         for item in scene.objects:
@@ -74,6 +77,7 @@ def tabulate(
       next_position: [P, rotations] int32, the position after MoveAhead along each heading.
     """
     classes = sorted({item.object_class for item in scene.objects})
+    room_types = _room_types([scene.room_type])
     object_class = np.array([classes.index(o.object_class) for o in scene.objects], np.int16)
     row_class = object_class[detections.owner]
     states = len(scene.points) * scene.grid.views
@@ -87,7 +91,7 @@ def tabulate(
         classes=tuple(classes),
         targets=tuple(targets),
         object_id=tuple(item.object_id for item in scene.objects),
-        room_type=np.array([scene.room_type], np.int8),
+        room_type=np.array([room_types.index(scene.room_type)], np.int8),
         position=scene.points,
         position_scene=np.zeros(len(scene.points), np.int16),
         next_position=next_position,
@@ -101,7 +105,13 @@ def tabulate(
         distance=action_distances(transitions(next_position, scene.grid), goals),
         raster=paint(detections.state, detections.box, row_class, states, IMAGE_SIZE * SUBPIXEL),
         grid=scene.grid,
+        room_types=room_types,
     )
+
+
+def _room_types(names: Iterable[str]) -> tuple[str, ...]:
+    """iTHOR's room types, then the others among `names`, sorted."""
+    return (*ROOM_TYPES, *sorted(set(names) - set(ROOM_TYPES)))
 
 
 def paint(
@@ -140,6 +150,7 @@ def paint(
 
 def join(rooms: Sequence[SceneTables], classes: Sequence[str]) -> SceneTables:
     """The tables of all rooms, one after the other; `classes` includes those of every room."""
+    room_types = _room_types(name for room in rooms for name in room.room_types)
     parts: dict[str, list[np.ndarray]] = {field: [] for field in FIELDS}
     first = {"R": 0, "P": 0, "O": 0}
     for room in rooms:
@@ -150,6 +161,8 @@ def join(rooms: Sequence[SceneTables], classes: Sequence[str]) -> SceneTables:
                 value = np.diff(value)
             elif indexed == "C":
                 value = number[value]  # -1 stays -1
+            elif indexed == "T":
+                value = np.array([*map(room_types.index, room.room_types)])[value]
             parts[field].append(value + first[indexed] if indexed in first else value)
         sizes = {"R": len(room.scenes), "P": len(room.position), "O": len(room.object_id)}
         first = {axis: first[axis] + sizes[axis] for axis in first}
@@ -161,6 +174,7 @@ def join(rooms: Sequence[SceneTables], classes: Sequence[str]) -> SceneTables:
         rooms[0],
         scenes=tuple(name for room in rooms for name in room.scenes),
         classes=tuple(classes),
+        room_types=room_types,
         object_id=tuple(name for room in rooms for name in room.object_id),
         **arrays,
     )

@@ -50,8 +50,8 @@ def test_what_is_collected_can_be_read(tmp_path: Path) -> None:
     path.write_text("an older file")
     collect.write_scenes(documents, path)
     first, second = metadata.read_scenes(path)
-    assert (first.name, first.room_type) == ("FloorPlan1", 0)
-    assert (second.name, second.room_type) == ("Mine", 3)
+    assert (first.name, first.room_type) == ("FloorPlan1", "kitchen")
+    assert (second.name, second.room_type) == ("Mine", "bathroom")
     assert len(first.objects) == 2
     assert first.default_rotation == 270
     assert [p.name for p in tmp_path.iterdir()] == ["scenes.json"]

@@ -16,6 +16,7 @@ from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneTables, dataset, tabulation
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode, Rooms
 from tdanet_jax.splits import make_split
+from tdanet_jax.vocabulary import ROOM_TYPES
 from tests.support import toy
 
 
@@ -106,7 +107,8 @@ def test_rooms_with_a_part_of_their_own() -> None:
     kinds = {"FloorPlan1": 0, "FloorPlan2": 0, "FloorPlan30": 0, "Attic": 2, "Den": 0, "Hall": 0}
     kinds |= {f"Own{i}": 1 for i in range(5)}
     scenes = [
-        dataclasses.replace(corridor, name=name, room_type=kind) for name, kind in kinds.items()
+        dataclasses.replace(corridor, name=name, room_type=ROOM_TYPES[kind])
+        for name, kind in kinds.items()
     ]
     parts = {"FloorPlan2": "test", "Den": "train", "Hall": "test"}
     parts |= {f"Own{i}": "train" for i in range(5)}
@@ -148,7 +150,49 @@ def test_a_grid_of_its_own_is_kept(rooms: SceneTables, tmp_path: Path) -> None:
     rest["grid"]["rotations"] = 7
     arrays["rest"] = np.frombuffer(json.dumps(rest).encode(), np.uint8)
     archive.write(path, arrays)
-    with pytest.raises(FileError, match="not a file of rooms .7 rotations"):
+    with pytest.raises(FileError, match=r"not a file of rooms \(7 rotations"):
+        dataset.load_rooms(path)
+
+
+def test_room_types_of_ones_own(tmp_path: Path) -> None:
+    """Their targets are what their rooms hold, seen or unseen as elsewhere; iTHOR's stay."""
+    shown = toy.thing("Laptop", (0.0, toy.CAMERA, 2.0)), toy.thing("Mug", (0.2, toy.CAMERA, 2.0))
+    kinds = {"B1": "study", "A1": "office", "A2": "office", "K": "kitchen"}
+    scenes = [
+        dataclasses.replace(toy.room(toy.line(3), *shown[: 2 - i % 2], name=name), room_type=kind)
+        for i, (name, kind) in enumerate(kinds.items())
+    ]
+    tables = tabulation.build(scenes)
+    assert tables.room_types == (*ROOM_TYPES, "office", "study")
+    assert tables.room_type.tolist() == [5, 4, 4, 0]
+    path = tmp_path / "rooms.npz"
+    parts = {"A1": "train", "A2": "test"}
+    dataset.save_rooms(Rooms(tables, Extras(parts=parts)), path)
+    rooms = dataset.load_rooms(path)
+    assert rooms.tables.room_types == tables.room_types
+    assert rooms.tables.subset(["A2"]).as_scene().room_type == "office"
+    assert rooms.tables.data_version == tables.with_known_targets().data_version
+    found = {
+        text: dataset.assign_rooms(make_split(text, validation), rooms, validation)
+        for text, validation in (("22/0", False), ("18/4", False), ("Vase", True))
+    }
+    assert found["22/0"].seen["office"] == ("Mug", "Laptop")
+    assert found["22/0"].seen["study"] == ("Mug", "Laptop")
+    assert found["18/4"].seen["office"] == ("Mug",)
+    assert found["18/4"].unseen["office"] == ("Laptop",)
+    assert found["18/4"].seen["kitchen"] == make_split("18/4").seen["kitchen"]
+    assert "A1" in found["18/4"].train_scenes
+    assert "A2" in found["18/4"].eval_scenes
+    assert found["Vase"].seen["office"] == ("Mug", "Laptop")
+    for broken in (("office", *ROOM_TYPES[1:], "a", "b"), (*ROOM_TYPES, "x", "x"), ROOM_TYPES,
+                   (*ROOM_TYPES, "../up", "b")):  # fmt: skip
+        dataset.save_rooms(Rooms(dataclasses.replace(tables, room_types=broken), None), path)
+        with pytest.raises(FileError, match="not a file of rooms"):
+            dataset.load_rooms(path)
+    dataset.save_rooms(
+        Rooms(dataclasses.replace(tables, scenes=("../B", "A", "C", "K")), None), path
+    )
+    with pytest.raises(FileError, match="must have no path separator"):
         dataset.load_rooms(path)
 
 

@@ -53,7 +53,7 @@ def read(tmp_path: Path, document: Any) -> Any:
 
 def test_a_scene_file(tmp_path: Path) -> None:
     [scene] = read(tmp_path, DOCUMENT)
-    assert (scene.name, scene.room_type) == ("Lab", 2)
+    assert (scene.name, scene.room_type) == ("Lab", "bedroom")
     assert scene.points[:, 2].tolist() == [0.0, 0.25, 0.5]
     assert [item.object_id for item in scene.objects] == ["Desk|0", "Mug|1"]
     desk, mug = scene.objects
@@ -132,7 +132,16 @@ CASES = [
     (["objects", 0, "objectOrientedBoundingBox"], {}, None),
     (["objects", 0, "objectOrientedBoundingBox"], {"cornerPoints": [[0, 0, 0]]}, "8 finite"),
     (["objects", 0, "parentReceptacles"], 3, r"Lab: Mug\|1: parentReceptacles"),
-    (["room_type"], "hall", "Lab: room_type 'hall'"),
+    (["room_type"], None, "Lab: no room type; give it in the file .*--room-type or --rooms"),
+    (["room_type"], 3, "Lab: room_type 3: not a name"),
+    (["room_type"], "", "Lab: room_type '': must have from 1 to 200 characters"),
+    (["room_type"], "Living Room", "Lab: room_type 'Living Room': did you mean living_room?"),
+    (["name"], " ", "name ' ': must have from 1 to 200 characters"),
+    (["name"], "x" * 201, "must have from 1 to 200 characters"),
+    (["name"], "../Lab", "name '../Lab': must have no path separator"),
+    (["name"], "a\\b", "must have no path separator"),
+    (["name"], "..", "must have no path separator"),
+    (["name"], "a\nb", "must have no path separator or control character"),
     (["name"], None, "a scene without a name"),
     (["split"], "half", "Lab: split 'half', not train or test"),
     (["split"], ["test"], "Lab: split "),

@@ -13,6 +13,7 @@ import numpy as np
 
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import hdf5
+from tdanet_jax.poses import ITHOR
 from tdanet_jax.scenes.offline import layout
 from tdanet_jax.scenes.offline.layout import Report, state_keys
 from tdanet_jax.scenes.tables import SceneTables
@@ -63,6 +64,17 @@ def write_folder(
         os.replace(temporary, out)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def check_layout(tables: SceneTables) -> None:
+    """Raises ValueError if the original layout cannot hold these rooms."""
+    own = [tables.room_types[kind] for kind in tables.room_type if kind >= len(ROOM_TYPES)]
+    if own or tables.grid != ITHOR:
+        what = (
+            f"rooms of type {own[0]}" if own else f"gridSize {tables.grid.grid_size:g}, turns of "
+        )
+        what += "" if own else f"{tables.grid.turn} degrees and horizons {[*tables.grid.horizons]}"
+        raise ValueError(f"{what}: the original layout has iTHOR's room types and grid alone")
 
 
 def write_scene(room: SceneTables, folder: Path) -> None:

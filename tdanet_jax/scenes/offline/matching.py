@@ -13,6 +13,7 @@ from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes.offline.layout import OBJECT_FILE
 from tdanet_jax.scenes.scene import Scene, SceneObject
 from tdanet_jax.scenes.visibility.build import Detections
+from tdanet_jax.vocabulary import ROOM_TYPES
 
 MOST_OBJECTS = 20_000
 #: The box in the image of an object that is visible, but has none in the data.
@@ -128,4 +129,4 @@ class BoxMatcher:
             box=np.array([row[2] for row in rows], np.int16).reshape(-1, 4),
             visible=np.array([row[3] for row in rows], bool),
         )
-        return Scene(name, room_type, points, objects), detections
+        return Scene(name, ROOM_TYPES[room_type], points, objects), detections

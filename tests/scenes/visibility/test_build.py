@@ -139,7 +139,13 @@ def wall(kind: str, z: float, **shape: float) -> SceneObject:
 
 def test_what_hides_and_what_does_not() -> None:
     apple = toy.thing("Apple", (0.0, toy.CAMERA, 1.2))
-    for kind, hides in (("Sofa", True), ("Fridge", True), ("Curtains", False), ("Chair", False)):
+    for kind, hides in (
+        ("Sofa", True),
+        ("Wall", True),
+        ("Fridge", True),
+        ("Curtains", False),
+        ("Chair", False),
+    ):
         found = seen(toy.room(toy.line(1), apple, wall(kind, 0.6)), 0, 0)
         assert ("Apple" in found) != hides, kind
         assert kind in found
