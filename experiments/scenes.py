@@ -31,7 +31,7 @@ from experiments.console import (
     reporter,
 )
 from tdanet_jax.io import files
-from tdanet_jax.poses import ITHOR
+from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.splits import make_split
 from tdanet_jax.vocabulary import ALL_TARGETS, FIELD_OF_VIEW, IMAGE_SIZE, ROOM_TYPES
 
@@ -296,6 +296,8 @@ class Collect:
 
     scenes: tyro.conf.Positional[tuple[str, ...]]
     """Rooms as NAME=TYPE, such as FloorPlan1=kitchen."""
+    grid_size: float = ITHOR.grid_size
+    """Metres between neighbouring reachable positions, from 0.05 to 0.5."""
     out: Path = Path("scenes.json")
     """Scene file to write; it must not exist."""
 
@@ -314,9 +316,11 @@ class Collect:
                 fail(f"{word}: not NAME=TYPE, with a type such as {', '.join(ROOM_TYPES)}")
             check_label(Label(kind))
             rooms.append((name, kind))
+        grid = PoseGrid(self.grid_size)
         controller = _start_ai2thor()
         try:
-            collect.write_scenes(collect.collect(controller, rooms), self.out)
+            found = collect.collect(controller, rooms, grid.grid_size)
+            collect.write_scenes(found, self.out)
         finally:
             controller.stop()
         console.print(f"{self.out}")

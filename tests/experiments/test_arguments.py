@@ -170,8 +170,13 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("collect FloorPlan1=kitchen --out full/file", "--out full/file: exists"),
         ("collect FloorPlan1=kitchen --out no/a.json", "--out no/a.json: no such folder"),
         ("collect", "collect: name a room, say FloorPlan1=kitchen"),
-        ("collect FloorPlan1", "FloorPlan1: not NAME=TYPE with a type of kitchen"),
-        ("collect FloorPlan1=hall", "FloorPlan1=hall: not NAME=TYPE"),
+        ("collect FloorPlan1", "FloorPlan1: not NAME=TYPE, with a type such as kitchen"),
+        ("collect FloorPlan1=a/b", "room_type 'a/b': must have no path separator"),
+        ("collect FloorPlan1=hall --grid-size 1", "gridSize 1.0: must be from 0.05 to 0.5 metres"),
+        (
+            "import --from empty --part test",
+            "--room-type, --part and --rooms: only with a scene file",
+        ),
     ],
 }
 
