@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneError, SceneTables, tabulation
 from tdanet_jax.scenes.visibility import geometry
 from tdanet_jax.vocabulary import ALL_TARGETS
@@ -142,6 +143,8 @@ def test_the_version_follows_every_field(rooms: SceneTables, field: str) -> None
         changed.flat[-1] = ~changed.flat[-1] if value.dtype == bool else changed.flat[-1] + 1
     elif isinstance(value, tuple):
         changed = (*value[:-1], value[-1] + "x")
+    elif isinstance(value, PoseGrid):
+        changed = PoseGrid(rotations=12)
     else:
         changed = value + 1
     other = dataclasses.replace(rooms, **{field: changed})

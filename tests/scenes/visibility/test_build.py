@@ -112,7 +112,7 @@ def test_common_views_of_two_grids_are_the_same(other: PoseGrid) -> None:
                     for a, b in zip(mine[1:], theirs[1:], strict=True):
                         np.testing.assert_array_equal(a[rows[0]], b[rows[1]])
                     compared += rows[0].sum()
-        assert compared > 5
+        assert compared >= 5
 
 
 def test_looking_down_moves_the_picture_up() -> None:
