@@ -155,9 +155,11 @@ def turn(
     """Heading and horizon after an action, which moves each by at most one."""
     right = jnp.where(action == Action.ROTATE_RIGHT, 1, 0)
     right = jnp.where(action == Action.ROTATE_LEFT, -1, right)
-    higher, lower = 0, len(grid.horizons) - 1
-    if lower > 1:  # with two horizons, as in iTHOR, there is nothing to compute
-        higher, lower = jnp.maximum(horizon - 1, higher), jnp.minimum(horizon + 1, lower)
+    lowest = len(grid.horizons) - 1
+    higher: jax.Array | int = 0
+    lower: jax.Array | int = lowest
+    if lowest > 1:  # with two horizons, as in iTHOR, there is nothing to compute
+        higher, lower = jnp.maximum(horizon - 1, 0), jnp.minimum(horizon + 1, lowest)
     horizon = jnp.where(action == Action.LOOK_DOWN, lower, horizon)
     horizon = jnp.where(action == Action.LOOK_UP, higher, horizon)
     return modulo(heading + right, grid.rotations), horizon
