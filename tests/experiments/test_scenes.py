@@ -91,6 +91,9 @@ def test_offices_on_another_grid_as_the_page_shows_them(
         assert {row["horizon"] for row in rows} == {0}
         assert {row["scene"] for row in rows} == {"Office-2"}
         assert max(row["e"] for row in rows) <= 200
+    export = ["export", "--data", "offices.npz", "--out", "original"]
+    assert "rooms of type office: the original layout has" in fails(scenes, export, capsys)
+    assert not Path("original").exists()
     rooms = dataset.load_rooms("offices.npz")
     assert rooms.tables.grid == PoseGrid(0.5, 4, (0,))
     assert len(rooms.tables.position) * 4 == rooms.tables.num_states

@@ -23,10 +23,10 @@ from tdanet_jax.vocabulary import IMAGE_SIZE
 
 
 def cosine_and_sine(degrees: int) -> tuple[np.float32, np.float32]:
-    """Of whole degrees: the float32 numbers nearest to both, on every machine.
+    """The float32 numbers nearest to those of whole degrees, on every machine.
 
-    Machines differ in the last bits of a cosine, which no cosine of whole degrees is near enough
-    to half a float32 to show (`tests/scenes/visibility/test_build.py`).
+    Machines differ in the last bits of a float64 cosine. That does not show: no cosine of whole
+    degrees is so near to the middle between two float32 numbers.
     """
     angle = math.radians(degrees)
     return np.float32(round(math.cos(angle), 14)), np.float32(round(math.sin(angle), 14))
