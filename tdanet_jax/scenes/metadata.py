@@ -178,12 +178,13 @@ def read_scenes(path: Path, labels: Labels | None = None) -> list[Scene]:
     if not documents:
         raise SceneError(f"{path}: no scenes")
     labels = Labels() if labels is None else labels
+    names = [document.get("name") for document in documents if isinstance(document, Mapping)]
+    if unknown := [name for name in labels.rooms if name not in names]:
+        raise SceneError(f"{path}: no room is called {unknown[0]}, which --rooms lists")
     scenes = [_read_scene(path, document, labels) for document in documents]
     name, times = Counter(scene.name for scene in scenes).most_common(1)[0]
     if times > 1:
         raise SceneError(f"{path}: {name}: name occurs {times} times")
-    if unknown := sorted(set(labels.rooms) - {scene.name for scene in scenes}):
-        raise SceneError(f"{path}: no room is called {unknown[0]}, which --rooms lists")
     for scene in scenes:
         if scene.grid != scenes[0].grid:
             raise SceneError(
