@@ -307,6 +307,13 @@ FAULTS = (
     Fault("validation looks at own test rooms", "scenes/dataset.py",
           "mine, rest = mine[:first], mine[first:]", "mine = mine[:first]",
           "scenes/test_dataset.py"),
+    Fault("targets of own types from all rooms", "scenes/dataset.py",
+          "tables.room_type[tables.object_scene] == room_type",
+          "tables.room_type[tables.object_scene] >= 0", "scenes/test_dataset.py"),
+    Fault("a step along the direction before", "poses.py", "self.turn * rotation + 45",
+          "self.turn * rotation", "test_poses.py"),
+    Fault("every map has cells of a quarter metre", ODOMETRY, "POSITION_SCALE / self.grid.grid_size",
+          "POSITION_SCALE / 0.25", "sensors/test_odometry.py"),
 )  # fmt: skip
 
 
