@@ -13,6 +13,7 @@ import tyro
 from experiments.console import console, fail, reporter
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE
+from tdanet_jax.poses import TURNS
 
 if TYPE_CHECKING:
     from tdanet_jax.analysis.trace import Player, Trace
@@ -29,8 +30,8 @@ class Choice:
     target: str | None = None
     """Target class, such as Laptop; requires --scene."""
     start: tuple[float, float, int] | None = None
-    """x and z in metres, rotation in degrees (a multiple of 45). The episode starts at the nearest
-    reachable point, at most 0.5 m away. By default, a start is drawn."""
+    """x and z in metres, rotation in degrees (in iTHOR a multiple of 45). The episode starts at the
+    nearest reachable point, at most 0.5 m away. By default, a start is drawn."""
     episode: int | None = None
     """Instead of --scene and --target: an episode of the first checkpoint's episodes.jsonl, counted
     from 0. It is shown as recorded; further checkpoints play it from the same start."""
@@ -71,8 +72,8 @@ def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
         start = f"--start {' '.join(map(str, choice.start))}"
         if not all(map(math.isfinite, choice.start)):
             fail(f"{start}: must be finite")
-        if choice.start[2] % 45:
-            fail(f"{start}: rotation {choice.start[2]}: not a multiple of 45 degrees")
+        if choice.start[2] % min(TURNS):
+            fail(f"{start}: rotation {choice.start[2]}: not a multiple of {min(TURNS)} degrees")
     for run in runs:
         configs.load(folder_of(run) / CONFIG_FILE)
     if choice.episode is not None:

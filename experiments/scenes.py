@@ -32,7 +32,7 @@ from experiments.console import (
     reporter,
 )
 from tdanet_jax.io import files
-from tdanet_jax.poses import GRID_SIZE, VIEWS
+from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.splits import UNSEEN, make_split
 from tdanet_jax.vocabulary import ALL_TARGETS, FIELD_OF_VIEW, IMAGE_SIZE, ROOM_TYPES
 
@@ -81,7 +81,7 @@ class Verify:
         start = time.monotonic()
         rooms = ithor.load_scenes()
         check_at_most("rooms", self.rooms, len(rooms))
-        check_at_most("views", self.views, min(len(room.points) for room in rooms) * VIEWS)
+        check_at_most("views", self.views, min(len(room.points) for room in rooms) * ITHOR.views)
         train = set(make_split("22/0").train_scenes)
         parts = {
             "train": [room for room in rooms if room.name in train],
@@ -106,9 +106,9 @@ class Inspect:
     position: tuple[float, float] | None = None
     """x and z in metres, at the nearest reachable point. By default, a view of many objects."""
     rotation: int = 0
-    """Degrees clockwise from +z, a multiple of 45; requires --position."""
+    """Degrees clockwise from +z, in iTHOR a multiple of 45; requires --position."""
     horizon: int = 0
-    """0 or 30 degrees down; requires --position."""
+    """Degrees down, in iTHOR 0 or 30; requires --position."""
     scenes: Path | None = None
     """Scene file (JSON) with the room; by default the bundled rooms."""
     data: str | None = None
@@ -167,6 +167,15 @@ class Import:
 
     scenes: tyro.conf.Positional[Path | None] = None
     """Scene file."""
+    room_type: str | None = None
+    """Type of the rooms for which neither their file, nor --rooms, nor the name says it: kitchen,
+    living_room, bedroom, bathroom, or one of your own, such as office. Names that begin with that
+    of an iTHOR room, such as FloorPlan12-3, say it."""
+    part: Literal["train", "test"] | None = None
+    """Likewise the part of every split that they belong to."""
+    rooms: Path | None = None
+    """Table (CSV) with the columns name, room_type and part: what the rooms' files do not say.
+    Cells may be empty."""
     source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
     """Folder with the rooms' folders; files next to them (parents, class graph, test episodes) are
     imported as well. An interrupted import continues where it stopped."""
@@ -178,13 +187,6 @@ class Import:
     frame_size: str | None = None
     """Requires --from. WIDTHxHEIGHT in pixels of the recorded frames, such as 640x480; by default
     as images.hdf5 or metadata.json have it, otherwise 300x300."""
-    rooms: Path | None = None
-    """Requires --from. Table (CSV) with the columns name, room_type and part, for rooms whose names
-    do not begin with that of an iTHOR room, or that belong elsewhere."""
-    room_type: Literal["kitchen", "living_room", "bedroom", "bathroom"] | None = None
-    """Requires --from. Type of all rooms for which neither the table nor the name says it."""
-    part: Literal["train", "test"] | None = None
-    """Requires --room-type. The part of every split that those rooms belong to."""
 
     def run(self) -> None:
         """Writes the file, and reports what in the rooms cannot be reached."""
@@ -194,11 +196,9 @@ class Import:
 
         if (self.scenes is None) == (self.source is None):
             fail("import needs a scene file, or --from a folder of rooms, and not both")
-        for flag in ("features", "frame_size", "rooms", "room_type"):
+        for flag in ("features", "frame_size"):
             if getattr(self, flag) and self.source is None:
                 fail(f"--{flag.replace('_', '-')}: needs --from")
-        if self.part is not None and self.room_type is None:
-            fail("--part: needs --room-type")
         check_new_file(self.out)
         kinds, frame = self._kinds(), self._frame()
         maps, maps_out = None, features.features_path(self.out)
@@ -223,11 +223,10 @@ class Import:
         """Room type and part of the rooms, as the flags say."""
         from tdanet_jax.scenes import room_names
 
+        other = room_names.RoomKind(self.room_type, self.part)
+        room_names.check_kind(other)
         table = room_names.read_table(self.rooms) if self.rooms is not None else {}
-        if self.room_type is None:
-            return room_names.Kinds(table)
-        kind = room_names.RoomKind(ROOM_TYPES.index(self.room_type), self.part)
-        return room_names.Kinds(table, kind)
+        return room_names.Kinds(table, other)
 
     def _frame(self) -> frames.Frame | None:
         """The size of the frames, if --frame-size says it."""
@@ -248,7 +247,7 @@ class Import:
         if self.scenes is not None:
             with reporter("rooms") as report:
                 return dataset.build_rooms(
-                    self.scenes, lambda done, total: report(done / total, "rebuilt")
+                    self.scenes, lambda done, total: report(done / total, "rebuilt"), kinds
                 )
         assert self.source is not None
         with reporter("import") as report:
@@ -305,6 +304,7 @@ class Export:
         parents = extras.parents if extras and extras.parents else named_parents(tables)
         if self.scenes:
             tables = tables.subset(self.scenes)
+        exporter.check_layout(tables)
         vectors = None
         if self.vectors:
             vectors = words.load_word_vectors(self.word_vectors, tables.classes).table(
@@ -358,12 +358,15 @@ class Collect:
 
     scenes: tyro.conf.Positional[tuple[str, ...]]
     """Rooms as NAME=TYPE, such as FloorPlan1=kitchen."""
+    grid_size: float = ITHOR.grid_size
+    """Metres between neighbouring reachable positions, from 0.05 to 0.5."""
     out: Path = Path("scenes.json")
     """Scene file to write; it must not exist."""
 
     def run(self) -> None:
         """Starts AI2-THOR, visits the rooms, writes the file."""
         from tdanet_jax.scenes import collect
+        from tdanet_jax.scenes.room_names import RoomKind, check_kind
 
         check_new_file(self.out)
         if not self.scenes:
@@ -371,12 +374,15 @@ class Collect:
         rooms = []
         for word in self.scenes:
             name, _, kind = word.rpartition("=")
-            if not name or kind not in ROOM_TYPES:
-                fail(f"{word}: not NAME=TYPE with a type of {', '.join(ROOM_TYPES)}")
+            if not name or not kind:
+                fail(f"{word}: not NAME=TYPE, with a type such as {', '.join(ROOM_TYPES)}")
+            check_kind(RoomKind(kind))
             rooms.append((name, kind))
+        grid = PoseGrid(self.grid_size)
         controller = _start_ai2thor()
         try:
-            collect.write_scenes(collect.collect(controller, rooms), self.out)
+            found = collect.collect(controller, rooms, grid.grid_size)
+            collect.write_scenes(found, self.out)
         finally:
             controller.stop()
         console.print(f"{self.out}")
@@ -388,7 +394,7 @@ def _start_ai2thor() -> Any:
     except ImportError:
         fail("collect needs AI2-THOR: pip install ai2thor")
     return controller.Controller(
-        gridSize=GRID_SIZE, width=IMAGE_SIZE, height=IMAGE_SIZE, fieldOfView=FIELD_OF_VIEW
+        gridSize=ITHOR.grid_size, width=IMAGE_SIZE, height=IMAGE_SIZE, fieldOfView=FIELD_OF_VIEW
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
+from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.registry import SENSORS
 
 
@@ -20,11 +21,13 @@ class ObservationSpec:
       image: the "raster" of classes in 7 x 7 cells, the imported "features" of ResNet-18, or None.
       sensors: what it senses in addition to its detections, in the order of the network's inputs:
         names of `SENSORS`, or dotted names of modules of custom sensors.
+      grid: the poses that it can take, which sensors must know; networks do not depend on it.
     """
 
     rows: Literal["object", "class"] = "object"
     image: Literal["raster", "features"] | None = None
     sensors: tuple[str, ...] = ()
+    grid: PoseGrid = ITHOR
 
     def agent_name(self, model: str) -> str:
         """A model's name, and its sensors, which the paper's agents lack: tdanet, --odometry."""

@@ -19,6 +19,8 @@ SCENE_NUMBERS = {
     "bedroom": range(301, 331),
     "bathroom": range(401, 431),
 }
+#: Room type of each iTHOR room.
+ITHOR_ROOMS = {f"FloorPlan{n}": room for room, numbers in SCENE_NUMBERS.items() for n in numbers}
 TRAIN_SCENES_PER_TYPE = 20
 #: `--validation` trains on the first 16 training rooms of a type and evaluates on the last 4.
 VALIDATION_TRAIN_SCENES_PER_TYPE = 16

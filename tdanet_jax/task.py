@@ -10,12 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tdanet_jax import poses
 from tdanet_jax import words as word_vectors
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.env import reward, zero_shot
 from tdanet_jax.env.environment import Environment
-from tdanet_jax.env.params import TEST_STEP_LIMITS, FeatureMaps, make_params
+from tdanet_jax.env.params import FeatureMaps, limits_of_tests, make_params
 from tdanet_jax.env.reward import Parents
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.models import class_graph
@@ -23,12 +22,12 @@ from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary, make_vocabulary
 from tdanet_jax.models.factory import make_model, resolve_precision
 from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes.dataset import Extras, Rooms, assign_rooms, load_rooms
 from tdanet_jax.scenes.offline.features import features_path, load_features
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.splits import Split, make_split
-from tdanet_jax.vocabulary import ROOM_TYPES
 from tdanet_jax.words import WordVectors
 
 
@@ -188,7 +187,7 @@ def make_task(
     train_words = zero_shot.hide_words(words, tables.classes, split.hidden)
     parents = _parents(seen_rooms, split, extras)
     trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]
-    train_maps, eval_maps = _feature_maps(config.model, model, features, trains)
+    train_maps, eval_maps = _feature_maps(config.model, model, features, trains, tables.grid)
     rewarded = config.learner.partial_reward
     similarity = None
     if rewarded == "similarity":
@@ -202,7 +201,7 @@ def make_task(
             seen_rooms,
             split.seen,
             parents if rewarded == "parents" else reward.no_parents(seen_rooms),
-            [config.learner.step_limit] * len(ROOM_TYPES),
+            [config.learner.step_limit] * len(tables.room_types),
             model.spec,
             similarity=similarity,
             features=train_maps,
@@ -210,9 +209,9 @@ def make_task(
         ),
         eval_params=make_params(
             tables,
-            {room: split.seen[room] + split.unseen[room] for room in ROOM_TYPES},
+            {room: split.seen[room] + split.unseen[room] for room in split.seen},
             parents,
-            TEST_STEP_LIMITS,
+            limits_of_tests(tables),
             model.spec,
             features=eval_maps,
             scenes=split.eval_scenes,
@@ -224,7 +223,7 @@ def make_task(
 
 
 def _feature_maps(
-    name: str, model: ActorCritic, features: np.ndarray | None, trains: np.ndarray
+    name: str, model: ActorCritic, features: np.ndarray | None, trains: np.ndarray, grid: PoseGrid
 ) -> tuple[FeatureMaps | None, FeatureMaps | None]:
     """The maps for the training positions [P] bool, and for all; none if the model needs none."""
     if not model.encoder.maps:
@@ -234,7 +233,7 @@ def _feature_maps(
     flat = features.reshape(*features.shape[:2], -1).swapaxes(1, 2)  # cells before channels
     maps = jnp.asarray(np.ascontiguousarray(flat))  # shared by both: nothing is copied
     chosen = (np.flatnonzero(trains), np.arange(len(trains)))
-    train, all_positions = (FeatureMaps(maps, poses.join(positions)) for positions in chosen)
+    train, all_positions = (FeatureMaps(maps, grid.join(positions)) for positions in chosen)
     return train, all_positions
 
 

@@ -24,7 +24,7 @@ from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
 from tdanet_jax.models.classes import ClassVocabulary, load_vocabulary
 from tdanet_jax.models.factory import make_model
-from tdanet_jax.poses import ROTATIONS
+from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.sensors import suite
 from tdanet_jax.sensors.detections import centre_and_area, merge_classes
 from tdanet_jax.sensors.sensor import Frame, Motion, Start
@@ -35,8 +35,6 @@ from tdanet_jax.words import WordVectors
 
 #: Rows and labels are padded to multiples of these, so that few shapes are ever compiled.
 ROW_BLOCK, LABEL_BLOCK = 16, 64
-#: Degrees by which a simulator may miss a multiple of 45.
-TOLERANCE = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +79,7 @@ class Agent:
       classes: the training run's vocabulary. A model with a row per class is shown objects of the
         known classes alone; any other model is shown whatever has a name.
       model, weights: the network and its parameters.
+      grid: the turns and steps of the world in which it acts, which its sensors must know.
     """
 
     def __init__(
@@ -89,10 +88,13 @@ class Agent:
         weights: Any,
         vectors: WordVectors,
         classes: ClassVocabulary | None = None,
+        grid: PoseGrid = ITHOR,
     ) -> None:
         self.config = config
+        self.grid = grid
         self.classes = ClassVocabulary() if classes is None else classes
         self.model: ActorCritic = make_model(config, self.classes)
+        self.spec = dataclasses.replace(self.model.spec, grid=grid)
         self.weights = weights
         self._vectors = vectors
         self._labels = {class_words(name): i for i, name in enumerate(self.classes.names)}
@@ -103,23 +105,20 @@ class Agent:
         """The state at the start of an episode.
 
         Args:
-          rotation: degrees clockwise, a multiple of 45; multiples of 90 lie along the grid on which
-            the agent moves. Only networks with sensors (`--odometry`) need it.
-          horizon: degrees down, 0 or 30; likewise.
+          rotation: degrees clockwise, a multiple of the grid's turn (in iTHOR 45); multiples of 90
+            lie along the grid on which the agent moves. Only networks with sensors (`--odometry`)
+            need it.
+          horizon: degrees down, among the grid's (in iTHOR 0 and 30); likewise.
 
         Raises:
-          ValueError: the rotation is not a multiple of 45, or the horizon neither 0 nor 30.
+          ValueError: the grid has no such rotation or horizon.
         """
-        eighths = round(rotation / 45)
-        if abs(rotation - 45 * eighths) > TOLERANCE:
-            raise ValueError(f"rotation {rotation}: not a multiple of 45 degrees")
-        if min(abs(horizon), abs(horizon - 30)) > TOLERANCE:
-            raise ValueError(f"horizon {horizon}: neither 0 nor 30 degrees")
-        start = Start(jnp.int32(eighths % ROTATIONS), jnp.int32(horizon > 15))
+        turn, down = self.grid.nearest_view(rotation, horizon)
+        start = Start(jnp.int32(turn), jnp.int32(down))
         return AgentState(
             recurrent=actor_critic.initial_state(self.model, self.weights, 1),
             action=jnp.int32(NUM_ACTIONS),
-            sensors=suite.init(self.model.spec, start),
+            sensors=suite.init(self.spec, start),
             target=jnp.int32(-1),
         )
 
@@ -134,9 +133,9 @@ class Agent:
         """One step.
 
         The returned state assumes that the decision is carried out (otherwise replace its
-        `action`), and that MoveAhead leads to the next point of the grid: 0.25 m along one axis, or
-        along both on a diagonal. With `--triangulation` the camera's field of view must be 90
-        degrees in both directions.
+        `action`), and that MoveAhead leads to the next point of the grid: one cell along one axis,
+        or along both on a diagonal (`PoseGrid.steps`). With `--triangulation` the camera's field of
+        view must be 90 degrees in both directions.
 
         Args:
           state: from `start` or the previous step.
@@ -156,7 +155,7 @@ class Agent:
             raise ValueError(
                 f"{self.config.model} needs an image; an agent is shown detections alone"
             )
-        if self.model.spec.sensors and blocked is None and state.action == Action.MOVE_AHEAD:
+        if self.spec.sensors and blocked is None and state.action == Action.MOVE_AHEAD:
             raise ValueError("the agent has odometry: say whether its MoveAhead was `blocked`")
         obs, owner = self._observe(detections, target)
         state, out, attention = self._decide(
@@ -185,7 +184,7 @@ class Agent:
         """
         labels = np.array([self._index(d.label) for d in detections], np.int32)
         corners = np.array([(d.x1, d.y1, d.x2, d.y2) for d in detections]).reshape(-1, 4)
-        if self.model.spec.rows == "class":
+        if self.spec.rows == "class":
             labels, owner = np.unique(labels, return_inverse=True)
             order = np.argsort(owner, kind="stable")
             _, found = merge_classes(owner[order], corners[order])
@@ -231,7 +230,7 @@ class Agent:
         blocked: jax.Array,
     ) -> tuple[AgentState, Output, jax.Array | None]:
         """The state but for the next action, policy and value, and the attention."""
-        spec = self.model.spec
+        spec = self.spec
         frame = Frame(obs.classes[0], obs.boxes[0], obs.mask[0], obs.target[0])
         sensors = suite.update(spec, state.sensors, Motion(state.action, blocked))
         sensors = suite.clear(spec, sensors, state.target != frame.target)
@@ -245,18 +244,20 @@ class Agent:
         return AgentState(recurrent, state.action, sensors, frame.target), out, attention
 
 
-def load(run: Path | str) -> Agent:
+def load(run: Path | str, grid: PoseGrid = ITHOR) -> Agent:
     """The agent of a run's newest checkpoint, or of a point of its history. Needs no rooms.
 
     Args:
       run: the run's folder, or a file `history/<updates>.npz` in it.
+      grid: the turns and steps of the world in which the agent acts, if it has sensors; it may
+        have been trained on another.
 
     Raises:
       ValueError: the folder holds no run, or its checkpoint cannot be read.
     """
     config, weights, classes = read(run)
     vectors = word_vectors.load_word_vectors(config.word_vectors, classes.names)
-    return Agent(config, weights, vectors, classes)
+    return Agent(config, weights, vectors, classes, grid)
 
 
 def read(run: Path | str) -> tuple[TrainConfig, Any, ClassVocabulary]:

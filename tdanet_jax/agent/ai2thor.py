@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 
 from tdanet_jax.agent.agent import Agent, Decision, Detection
-from tdanet_jax.poses import GRID_SIZE, ROTATIONS, STEPS
+from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.vocabulary import (
     ACTION_NAMES,
     FIELD_OF_VIEW,
@@ -26,20 +26,29 @@ from tdanet_jax.vocabulary import (
     class_words,
 )
 
-#: Arguments of AI2-THOR's `Controller` that match the rooms in which agents are trained.
-SETTINGS: dict[str, Any] = {
-    "width": IMAGE_SIZE,
-    "height": IMAGE_SIZE,
-    "fieldOfView": FIELD_OF_VIEW,
-    "visibilityDistance": VISIBILITY_DISTANCE,
-    "gridSize": GRID_SIZE,
-    "rotateStepDegrees": 360 // ROTATIONS,
-    "snapToGrid": False,  # AI2-THOR refuses to combine it with turns of 45 degrees
-    "renderInstanceSegmentation": True,
-}
+
+def settings(grid: PoseGrid = ITHOR) -> dict[str, Any]:
+    """Arguments of AI2-THOR's `Controller` that match the rooms in which agents are trained."""
+    return {
+        "width": IMAGE_SIZE,
+        "height": IMAGE_SIZE,
+        "fieldOfView": FIELD_OF_VIEW,
+        "visibilityDistance": VISIBILITY_DISTANCE,
+        "gridSize": grid.grid_size,
+        "rotateStepDegrees": grid.turn,
+        "snapToGrid": False,  # AI2-THOR refuses to combine it with turns of 45 degrees
+        "renderInstanceSegmentation": True,
+    }
+
+
+#: Those of iTHOR's rooms.
+SETTINGS = settings()
 
 #: Object types that are parts of the building; the rooms in which agents are trained have none.
 STRUCTURE = frozenset({IGNORED, "Ceiling", "Door", "Doorframe", "Doorway", "Room", "Wall"})
+
+#: What AI2-THOR's LookUp and LookDown tilt the camera by, unless they are told.
+LOOK_DEGREES = 30
 
 #: Metres and degrees by which AI2-THOR's pose may differ from the expected one.
 NEAR, ALIGNED = 0.05, 1.0
@@ -134,11 +143,13 @@ def play(
     """Plays one episode from the present pose of AI2-THOR's agent.
 
     Actions have the same effects as in the environment: MoveAhead along a diagonal moves one cell
-    along both axes, and the camera stays between level and 30 degrees down. Done is not sent to
-    AI2-THOR; it ends the episode, and success is judged by the last frame.
+    along both axes, and the camera stays within the grid's horizons, in iTHOR between level and 30
+    degrees down. Done is not sent to AI2-THOR; it ends the episode, and success is judged by the
+    last frame.
 
     Args:
-      controller: made with `SETTINGS`, its agent on the grid, at a multiple of 45 degrees.
+      controller: made with `SETTINGS` or, for an agent of another grid, `settings(agent.grid)`; its
+        agent on the grid, at a multiple of its turn.
       target: what to look for, in English; for `success`, an object type such as "Laptop".
       key: samples the actions, as in training; None takes the most probable ones.
       step_limit: actions after which the episode ends without success. Test episodes have 100, and
@@ -146,18 +157,23 @@ def play(
 
     Raises:
       KeyError: the target has a word without a word vector.
-      ValueError: the start's rotation is not a multiple of 45 degrees, or its horizon neither 0 nor
-        30 degrees; a frame has no detections; an action led to an unexpected pose, as with other
-        settings; or the agent requires an image.
+      ValueError: the agent's grid lacks the start's rotation or horizon, or has turns other than 45
+        and 90 degrees, along which AI2-THOR's MoveAhead leaves the grid; a frame has no detections;
+        an action led to an unexpected pose, as with other settings; or the agent requires an image.
     """
+    if agent.grid.turn not in (45, 90):
+        raise ValueError(
+            f"turns of {agent.grid.turn} degrees: AI2-THOR's MoveAhead leaves the grid along them; "
+            "only agents with turns of 45 or 90 degrees can play in it"
+        )
     if step_limit < 1:
         raise ValueError(f"step_limit {step_limit}: must be at least 1")
     event = controller.last_event
     places, decisions, unnamed = [_place(event)], [], set[str]()
     state = agent.start(places[0].rotation, places[0].horizon)
     # With its angles rounded, as Unity's are never exact.
-    rotation = 45 * (round(places[0].rotation / 45) % ROTATIONS)
-    horizon = 30 * round(places[0].horizon / 30)
+    view = agent.grid.nearest_view(places[0].rotation, places[0].horizon)
+    rotation, horizon = agent.grid.turn * view[0], agent.grid.horizons[view[1]]
     expected, blocked = places[0]._replace(rotation=rotation, horizon=horizon), False
     for step in range(step_limit):
         seen = detections(event)
@@ -166,7 +182,7 @@ def play(
         now = None if key is None else jax.random.fold_in(key, step)
         state, decision = agent.act(state, named, target, now, blocked)
         decisions.append(decision)
-        event, expected, blocked = _take(controller, event, expected, decision.action)
+        event, expected, blocked = _take(controller, event, expected, decision.action, agent.grid)
         places.append(_place(event))
         if decision.action == Action.DONE:
             break
@@ -181,7 +197,7 @@ def _place(event: Event) -> Place:
 
 
 def _take(
-    controller: Controller, event: Event, before: Place, action: Action
+    controller: Controller, event: Event, before: Place, action: Action, grid: PoseGrid
 ) -> tuple[Event, Place, bool]:
     """The frame after an action, the expected place, and whether the agent was blocked.
 
@@ -191,19 +207,25 @@ def _take(
     Raises:
       ValueError: AI2-THOR's agent is not at the expected place.
     """
-    heading, down = round(before.rotation / 45), round(before.horizon / 30)
+    heading = round(before.rotation) // grid.turn
+    down = grid.horizons.index(round(before.horizon))
     right = (action == Action.ROTATE_RIGHT) - (action == Action.ROTATE_LEFT)
-    turned = (heading + right) % ROTATIONS
-    looking = {Action.LOOK_UP: 0, Action.LOOK_DOWN: 1}.get(action, down)
+    turned = (heading + right) % grid.rotations
+    lower = (action == Action.LOOK_DOWN) - (action == Action.LOOK_UP)
+    looking = min(max(down + lower, 0), len(grid.horizons) - 1)
     ahead = action == Action.MOVE_AHEAD
     if not ahead and (turned, looking) == (heading, down):
         return event, before, False
-    dx, dz = (GRID_SIZE * int(cells) for cells in STEPS[heading])
+    dx, dz = (grid.grid_size * int(cells) for cells in grid.steps[heading])
     arguments = {"moveMagnitude": math.hypot(dx, dz)} if ahead else {}
+    tilt = abs(grid.horizons[looking] - grid.horizons[down])
+    if tilt not in (0, LOOK_DEGREES):
+        arguments["degrees"] = tilt
     event = controller.step(action=ACTION_NAMES[action], **arguments)
     moved = ahead and bool(event.metadata["lastActionSuccess"])
     x, z = (before.x + dx, before.z + dz) if moved else (before.x, before.z)
-    expected, after = Place(x, z, 45 * turned, 30 * looking), _place(event)
+    after = _place(event)
+    expected = Place(x, z, grid.turn * turned, grid.horizons[looking])
     turn = (expected.rotation - after.rotation + 180) % 360 - 180
     away = math.hypot(expected.x - after.x, expected.z - after.z)
     if not (away < NEAR and max(abs(turn), abs(expected.horizon - after.horizon)) < ALIGNED):

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle, Wedge
 from matplotlib.patheffects import withStroke
 
-from tdanet_jax import poses
 from tdanet_jax.analysis import labels
 from tdanet_jax.io import files
 from tdanet_jax.scenes.camera_view import CameraView
@@ -121,10 +120,11 @@ def draw_path(
       step: draws the path up to this step and the agent there; by default the whole path, with
         numbers of steps and some fields of view.
     """
-    pose = poses.split(trace.pose if step is None else trace.pose[: step + 1])
-    places, (turns, _) = tables.position[pose.position][:, [0, 2]], pose.degrees
+    grid = tables.grid
+    pose = grid.split(trace.pose if step is None else trace.pose[: step + 1])
+    places, (turns, _) = tables.position[pose.position][:, [0, 2]], grid.degrees(pose)
     if step is None:
-        level = poses.join(pose.position, pose.rotation)[:-1]  # the horizon left out
+        level = grid.join(pose.position, pose.rotation)[:-1]  # the horizon left out
         first = np.sort(np.unique(level, return_index=True)[1])
         for k in first[np.linspace(0, len(first) - 1, min(len(first), MOST_SECTORS)).astype(int)]:
             _draw_field_of_view(axes, places[k], turns[k], 0.1)

@@ -12,12 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tdanet_jax import poses
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.report import EPISODES_FILE
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
+from tdanet_jax.vocabulary import ACTION_NAMES
 
 #: How far from a start the nearest reachable point may be, in metres.
 FARTHEST_START = 0.5
@@ -28,8 +27,8 @@ class Start(NamedTuple):
 
     x: float  # metres
     z: float  # metres
-    rotation: int  # degrees clockwise from +z, a multiple of 45
-    horizon: int = 0  # degrees down, 0 or 30
+    rotation: int  # degrees clockwise from +z
+    horizon: int = 0  # degrees down
 
 
 class Recorded(NamedTuple):
@@ -62,10 +61,10 @@ def find(
             f"{target}: no target that can be seen in {scene}; there: {', '.join(found) or 'none'}"
         )
     if start is None:
-        room = ROOM_TYPES[tables.room_type[index]]
+        room = tables.room_types[tables.room_type[index]]
         return episodes.draw(tables, [scene], {room: [target]}, 1, seed)
     pose, goal = tables.nearest_state(index, *start), tables.targets.index(target)
-    x, _, z = tables.position[poses.split(pose).position]
+    x, _, z = tables.position[tables.grid.split(pose).position]
     away = math.hypot(x - start.x, z - start.z)
     if not away <= FARTHEST_START:  # so that NaN is refused, too
         raise ValueError(
@@ -113,7 +112,7 @@ def _parse(row: dict[str, Any], tables: SceneTables) -> Recorded:
         if name not in ACTION_NAMES:
             raise ValueError(f"{name!r}: no action; there are {', '.join(ACTION_NAMES)}")
     actions = np.array([ACTION_NAMES.index(name) for name in row["actions"]], int)
-    place = tables.position[poses.split(episode.pose[0]).position][[0, 2]]
+    place = tables.position[tables.grid.split(episode.pose[0]).position][[0, 2]]
     shortest = tables.distance[episode.pose[0], episode.target[0]] + 1
     if not np.allclose(place, start[:2], atol=1e-3) or shortest != row["L"]:
         raise ValueError("recorded on other scene tables")

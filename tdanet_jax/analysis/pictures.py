@@ -15,7 +15,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MultipleLocator
 
-from tdanet_jax import poses
 from tdanet_jax.analysis import drawing
 from tdanet_jax.analysis.drawing import BLUE, DASHED, FRAME, GREEN, ORANGE, SHADES
 from tdanet_jax.io import files
@@ -155,7 +154,8 @@ def most_telling_state(tables: SceneTables) -> int:
     pair = tables.row_state[tables.row_visible].astype(np.int64) * len(tables.classes)
     pair = np.unique(pair + tables.row_class[tables.row_visible])
     counts = np.bincount(pair // len(tables.classes), minlength=tables.num_states)
-    counts[poses.split(np.arange(tables.num_states)).horizon > 0] = -1
+    views = tables.grid.split(np.arange(tables.num_states))
+    counts[views.horizon != tables.grid.level] = -1
     return int(counts.argmax())
 
 
@@ -167,9 +167,9 @@ def room(scene: Scene, tables: SceneTables, state: int, path: Path) -> None:
       path: ends in a format of Matplotlib, say .png.
     """
     plan, seen = floor_plan.of_scene(scene), camera_view.of_pose(tables, state)
-    pose = poses.split(state)
+    pose = tables.grid.split(state)
     x, _, z = tables.position[pose.position]
-    rotation, horizon = pose.degrees
+    rotation, horizon = tables.grid.degrees(pose)
     rows = slice(tables.row_start[state], tables.row_start[state + 1])
     visible = dict(zip(tables.row_object[rows], tables.row_visible[rows], strict=True))
     colors = {i: _COLORS[visible[k]] for i, k in enumerate(plan.objects) if k in visible}

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax import poses
 from tdanet_jax.analysis import labels
 from tdanet_jax.analysis.trace import Trace
 from tdanet_jax.scenes import camera_view, floor_plan
 from tdanet_jax.scenes.floor_plan import FloorPlan
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.vocabulary import ACTION_NAMES, ROOM_TYPES
+from tdanet_jax.vocabulary import ACTION_NAMES
 
 #: Where the template takes the episode.
 SLOT = "{{EPISODE}}"
@@ -35,7 +34,7 @@ def page(traces: Sequence[Trace], tables: SceneTables) -> str:
     if any((t.pose[0], t.target) != (first.pose[0], first.target) for t in traces):
         raise ValueError("the traces start in different places or look for different targets")
     plan = floor_plan.of_room(tables, first.scene)
-    room = ROOM_TYPES[tables.room_type[tables.scenes.index(first.scene)]]
+    room = tables.room_types[tables.room_type[tables.scenes.index(first.scene)]]
     episode = {
         "scene": first.scene,
         "room": room.replace("_", " "),
@@ -88,15 +87,15 @@ def _plan(plan: FloorPlan, target: str, scale: float) -> dict[str, Any]:
 def _step(trace: Trace, tables: SceneTables, i: int) -> dict[str, Any]:
     """What the page shows before action i, or at the end, where there is no decision."""
     pose, last = int(trace.pose[i]), i == len(trace.actions)
-    parts = poses.split(pose)
+    parts = tables.grid.split(pose)
     x, _, z = tables.position[parts.position]
-    rotation, horizon = parts.degrees
+    rotation, horizon = tables.grid.degrees(parts)
     seen = camera_view.of_pose(tables, pose)
     weights = None if trace.attention is None or last else trace.attention[i]
     step: dict[str, Any] = {
         "place": [round(METRE * float(x)), round(-METRE * float(z))],
         "rotation": rotation,
-        "horizon": horizon,
+        "horizon": int(horizon),
         "boxes": [
             [name, *_rounded(IMAGE * box), bool(near)]
             for name, box, near in zip(*seen, strict=True)

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tdanet_jax import poses
 from tdanet_jax.agent import agent
 from tdanet_jax.analysis import attention
 from tdanet_jax.env import dynamics
@@ -143,7 +142,7 @@ def retrace(player: Player, tables: SceneTables, episode: Episodes, actions: np.
     goal = int(episode.target[0])
     trace = Trace(
         player=player.name,
-        scene=tables.scenes[tables.position_scene[poses.split(pose[0]).position]],
+        scene=tables.scenes[tables.position_scene[tables.grid.split(pose[0]).position]],
         target=tables.targets[goal],
         pose=pose,
         actions=np.asarray(actions, int),

@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from tdanet_jax import poses
 from tdanet_jax.env.reward import DONE_REWARD, SIMILARITY_SHARE, STEP_REWARD
 from tdanet_jax.env.types import EnvParams, EnvState, Observation, Outcome
 from tdanet_jax.sensors import odometry, suite
@@ -35,7 +34,7 @@ def start(
 ) -> EnvState:
     """The state at the start of the given episode."""
     zero = jnp.zeros_like(pose)
-    _, rotation, horizon = poses.split(pose)
+    _, rotation, horizon = params.grid.split(pose)
     shortest = params.distance[pose, target].astype(jnp.int32) + 1
     state = EnvState(
         pose=pose,
@@ -53,7 +52,7 @@ def start(
 def reset_state(key: jax.Array, params: EnvParams) -> EnvState:
     """A random episode: room type, scene, target and start, each uniform given the one before.
 
-    Starts are uniform over the positions from which the target can be reached and over the eight
+    Starts are uniform over the positions from which the target can be reached and over the
     rotations; the horizon is 0.
     """
     bits = jax.random.bits(key, (4,))
@@ -61,9 +60,17 @@ def reset_state(key: jax.Array, params: EnvParams) -> EnvState:
     scene = _pick_from(bits[1], params.room_scenes[room])
     pair = _pick_from(bits[2], params.scene_pairs[scene])
     position = params.start_position[_pick_from(bits[3], params.pair_starts[pair])]
-    rotation = (bits[0] & 7).astype(jnp.int32)  # bits that the choice of the room does not use
+    rotation = _draw_rotation(bits, params.grid.rotations)
     factor = _draw_area_factor(key, params.size_noise) if params.size_noise else None
-    return start(poses.join(position, rotation), params.pair_target[pair], params, factor)
+    pose = params.grid.look_level(position, rotation)
+    return start(pose, params.pair_target[pair], params, factor)
+
+
+def _draw_rotation(bits: jax.Array, rotations: int) -> jax.Array:
+    """A uniform rotation, from those bits of words [4] that other choices do not use."""
+    if rotations == 8:
+        return (bits[0] & 7).astype(jnp.int32)
+    return _pick(bits[0] << 24 | (bits[1] & 255) << 16 | (bits[2] & 255) << 8, rotations)
 
 
 def _draw_area_factor(key: jax.Array, noise: float) -> jax.Array:
@@ -84,8 +91,8 @@ def observe(state: EnvState, params: EnvParams) -> Observation:
     frame = _frame(state, params)
     features = None
     if params.features is not None and params.first_feature is not None:
-        position, *view = poses.split(state.pose)
-        features = params.features[params.first_feature[position] + poses.join(0, *view)]
+        position, *view = params.grid.split(state.pose)
+        features = params.features[params.first_feature[position] + params.grid.join(0, *view)]
     return Observation(
         classes=frame.classes,
         boxes=frame.boxes,
@@ -124,10 +131,10 @@ def is_visible(pose: jax.Array, cls: jax.Array, params: EnvParams) -> jax.Array:
 
 def move(pose: jax.Array, action: jax.Array, params: EnvParams) -> jax.Array:
     """The pose after an action; an impossible action leaves it as it is."""
-    position, rotation, horizon = poses.split(pose)
+    position, rotation, horizon = params.grid.split(pose)
     ahead = params.next_position[position, rotation]
     position = jnp.where(action == Action.MOVE_AHEAD, ahead, position)
-    return poses.join(position, *odometry.turn(rotation, horizon, action))
+    return params.grid.join(position, *odometry.turn(params.grid, rotation, horizon, action))
 
 
 def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome:
@@ -144,7 +151,8 @@ def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome
     reward = jnp.where(~done & earns, partial, STEP_REWARD)
     reward = jnp.where(success, DONE_REWARD + at_done, reward)
     steps = state.steps + 1
-    limit = params.step_limit[params.position_room[poses.split(pose).position].astype(jnp.int32)]
+    room = params.position_room[params.grid.split(pose).position]
+    limit = params.step_limit[room.astype(jnp.int32)]
     after = seen.replace(pose=pose, steps=steps)
     moved = suite.update(params.spec, after.sensors, Motion(action, pose == state.pose))
     after = after.replace(sensors=suite.observe(params.spec, moved, _frame(after, params)))

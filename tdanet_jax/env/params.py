@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,7 +13,6 @@ import numpy as np
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.sensors import detections
-from tdanet_jax.vocabulary import ROOM_TYPES
 
 if TYPE_CHECKING:
     from tdanet_jax.env.reward import Parents
@@ -20,6 +20,14 @@ if TYPE_CHECKING:
 
 #: Steps after which a test episode ends, by room type (Du et al. 2020 and its successors).
 TEST_STEP_LIMITS = (100, 200, 100, 100)
+#: In room types of a user's own, as in living rooms: they can be as large, or larger.
+OWN_TEST_STEP_LIMIT = 200
+
+
+def limits_of_tests(tables: SceneTables) -> tuple[int, ...]:
+    """Steps after which a test episode ends, by room type [T]."""
+    own = len(tables.room_types) - len(TEST_STEP_LIMITS)
+    return (*TEST_STEP_LIMITS, *[OWN_TEST_STEP_LIMIT] * own)
 
 
 class FeatureMaps(NamedTuple):
@@ -79,7 +87,7 @@ def make_params(
         raster=jnp.asarray(tables.raster, jnp.int8) if spec.image is not None else None,
         features=None if features is None else features.maps,
         first_feature=None if features is None else jnp.asarray(features.first, jnp.int32),
-        spec=spec,
+        spec=dataclasses.replace(spec, grid=tables.grid),
         size_noise=size_noise,
         **{name: jnp.asarray(v, jnp.int32) for name, v in pool.items()},
     )
@@ -113,13 +121,13 @@ def _episode_pool(
     """
     reachable = tables.reachable
     chosen = np.isin(np.array(tables.scenes), scenes)
-    room_scenes = np.zeros((len(ROOM_TYPES), 2), np.int64)
+    room_scenes = np.zeros((len(tables.room_types), 2), np.int64)
     scene_pairs: list[tuple[int, int]] = []
     pair_target: list[int] = []
     pair_starts: list[tuple[int, int]] = []
     starts: list[np.ndarray] = []
     total = 0
-    for room, room_name in enumerate(ROOM_TYPES):
+    for room, room_name in enumerate(tables.room_types):
         first_scene = len(scene_pairs)
         for scene in np.flatnonzero((tables.room_type == room) & chosen):
             first_pair = len(pair_target)

@@ -1,7 +1,7 @@
 """The data types of the environment.
 
-Axis letters: P positions, S = 16 P poses, C classes, G targets, K detections, Q (scene, target)
-pairs, R scenes.
+Axis letters: P positions, S poses, C classes, T room types, G targets, K detections, Q (scene,
+target) pairs, R scenes.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import jax
 from flax import struct
 
 from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.poses import PoseGrid
 
 #: Rows and columns of the class raster, the size of a ResNet-18 feature map.
 RASTER = (7, 7)
@@ -23,7 +24,7 @@ FEATURES = (49, 512)
 class EnvParams(struct.PyTreeNode):
     """Everything that the environment reads: scene tables, rewards and the lists of episodes."""
 
-    next_position: jax.Array  # [P, 8] int32, where MoveAhead leads, by heading
+    next_position: jax.Array  # [P, rotations] int32, where MoveAhead leads, by heading
     position_room: jax.Array  # [P] int8, room type of the position
     row_start: jax.Array  # [S + 1] int32, detections of a pose are rows row_start[s]:row_start[s+1]
     row_class: jax.Array  # [N + K] int32, class of a detection
@@ -33,9 +34,9 @@ class EnvParams(struct.PyTreeNode):
     target_class: jax.Array  # [G] int32, class of a target
     parent_class: jax.Array  # [G, 3] int32, -1 where a target has fewer parents
     parent_reward: jax.Array  # [G, 3] float32, R_p of the paper's Eq. 3
-    step_limit: jax.Array  # [4] int32, actions after which an episode is truncated, by room type
+    step_limit: jax.Array  # [T] int32, actions after which an episode is truncated, by room type
     room_pool: jax.Array  # [rooms] int32, room types that have an episode
-    room_scenes: jax.Array  # [4, 2] int32, first and number of the scenes of a room type
+    room_scenes: jax.Array  # [T, 2] int32, first and number of the scenes of a room type
     scene_pairs: jax.Array  # [R', 2] int32, first and number of a scene's (scene, target) pairs
     pair_target: jax.Array  # [Q] int32, the target of a pair
     pair_starts: jax.Array  # [Q, 2] int32, first and number of a pair's start positions
@@ -47,6 +48,11 @@ class EnvParams(struct.PyTreeNode):
     max_detections: int = struct.field(pytree_node=False)  # K, most detections in any pose
     spec: ObservationSpec = struct.field(pytree_node=False, default=ObservationSpec())
     size_noise: float = struct.field(pytree_node=False, default=0.0)  # LearnerConfig.size_noise
+
+    @property
+    def grid(self) -> PoseGrid:
+        """The poses at a position."""
+        return self.spec.grid
 
 
 class EnvState(struct.PyTreeNode):

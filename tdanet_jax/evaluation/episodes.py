@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tdanet_jax import poses
 from tdanet_jax.io import assets
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.splits import GROUPS, UNSEEN, Split, make_split
-from tdanet_jax.vocabulary import ROOM_TYPES
 
 ASSET = "episodes.npz"
 EPISODES_PER_ROOM_TYPE = 250
@@ -47,16 +45,16 @@ def draw(
     """Draws episodes as training does: uniformly a scene, then a target in it, then a start.
 
     Targets are those of the room type that can be reached from somewhere in the scene; starts are
-    positions from which the target can be reached, with any of the eight rotations and horizon 0.
+    positions from which the target can be reached, with any rotation and horizon 0.
     """
     rng = np.random.default_rng(seed)
     index = {name: i for i, name in enumerate(tables.scenes)}
     reachable = tables.reachable
     starts, goals = [], []
-    for room in ROOM_TYPES:
+    for kind, room in enumerate(tables.room_types):
         options = []
         for scene in scenes:
-            if ROOM_TYPES[tables.room_type[index[scene]]] != room:
+            if tables.room_type[index[scene]] != kind:
                 continue
             positions = np.flatnonzero(tables.position_scene == index[scene])
             found = [tables.targets.index(name) for name in targets.get(room, ())]
@@ -68,7 +66,7 @@ def draw(
             goal = found[rng.integers(len(found))]
             valid = positions[reachable[positions, goal]]
             position = valid[rng.integers(len(valid))]
-            starts.append(poses.join(position, rng.integers(poses.ROTATIONS)))
+            starts.append(tables.grid.look_level(position, rng.integers(tables.grid.rotations)))
             goals.append(goal)
     return Episodes(np.array(starts, np.int32), np.array(goals, np.int32))
 
@@ -133,7 +131,7 @@ def published(
             scene = scenes.get(episode.scene)
             if scene is None or episode.part != "test":
                 continue
-            if episode.target not in targets.get(ROOM_TYPES[tables.room_type[scene]], ()):
+            if episode.target not in targets.get(tables.room_types[tables.room_type[scene]], ()):
                 continue
             goal = tables.targets.index(episode.target)
             pose = tables.nearest_state(

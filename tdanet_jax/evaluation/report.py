@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 import tdanet_jax
-from tdanet_jax import poses
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.evaluation import paper
 from tdanet_jax.evaluation.episodes import Episodes
@@ -25,7 +24,7 @@ from tdanet_jax.registry import SENSORS
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.splits import GROUPS
 from tdanet_jax.task import Task
-from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS, ROOM_TYPES
+from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS
 
 #: Episodes and what happened in them, by group ("seen", "unseen").
 Played = Mapping[str, tuple[Episodes, Records]]
@@ -103,12 +102,12 @@ class Provenance:
 
 def columns(tables: SceneTables, episodes: Episodes, records: Records) -> Columns:
     """Records as named columns of length E, with names instead of indices."""
-    pose = poses.split(episodes.pose)
-    rotation, horizon = pose.degrees
+    pose = tables.grid.split(episodes.pose)
+    rotation, horizon = tables.grid.degrees(pose)
     scene = tables.position_scene[pose.position]
     return {
         "scene": np.array(tables.scenes)[scene],
-        "room": np.array(ROOM_TYPES)[tables.room_type[scene]],
+        "room": np.array(tables.room_types)[tables.room_type[scene]],
         "target": np.array(tables.targets)[episodes.target],
         "x": tables.position[pose.position, 0],
         "z": tables.position[pose.position, 2],
@@ -121,7 +120,9 @@ def columns(tables: SceneTables, episodes: Episodes, records: Records) -> Column
     }
 
 
-def _results(provenance: Provenance, groups: Mapping[str, Columns]) -> dict[str, Any]:
+def _results(
+    provenance: Provenance, groups: Mapping[str, Columns], room_types: tuple[str, ...]
+) -> dict[str, Any]:
     """The content of `results.json`."""
 
     def by(key: str, names: tuple[str, ...]) -> dict:
@@ -139,7 +140,7 @@ def _results(provenance: Provenance, groups: Mapping[str, Columns]) -> dict[str,
         "version": RESULTS_VERSION,
         **{name: origin.pop(name) for name in _HEAD},
         **{name: _summary(groups[name]) if name in groups else None for name in GROUPS},
-        "by_room": by("room", ROOM_TYPES),
+        "by_room": by("room", room_types),
         "by_target": by("target", ALL_TARGETS),
         **origin,
         "commit": code_version(),
@@ -198,7 +199,7 @@ def results(
         None writes nothing.
     """
     groups = {name: columns(tables, *pair) for name, pair in played.items()}
-    out = _results(provenance, groups)
+    out = _results(provenance, groups, tables.room_types)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         write_rows(folder, all_rows(tables, played))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from tdanet_jax.io import files
-from tdanet_jax.poses import GRID_SIZE
+from tdanet_jax.poses import ITHOR
 from tdanet_jax.scenes.scene import SceneError
 
 FIELDS = (
@@ -20,19 +20,22 @@ FIELDS = (
 )  # fmt: skip
 
 
-def collect(controller: Any, rooms: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
+def collect(
+    controller: Any, rooms: Iterable[tuple[str, str]], grid_size: float = ITHOR.grid_size
+) -> list[dict[str, Any]]:
     """The documents of a scene file, one per scene of AI2-THOR.
 
     Args:
       controller: an `ai2thor.controller.Controller`, or an object with its `reset` and `step`.
       rooms: (AI2-THOR scene name, room type) pairs.
+      grid_size: metres between neighbouring reachable positions.
 
     Raises:
       SceneError: AI2-THOR reports that an action failed.
     """
     documents = []
     for name, room_type in rooms:
-        start = controller.reset(scene=name, gridSize=GRID_SIZE).metadata
+        start = controller.reset(scene=name, gridSize=grid_size).metadata
         event = controller.step(action="GetReachablePositions")
         if not event.metadata["lastActionSuccess"]:
             raise SceneError(f"{name}: GetReachablePositions: {event.metadata['errorMessage']}")
@@ -40,6 +43,7 @@ def collect(controller: Any, rooms: Iterable[tuple[str, str]]) -> list[dict[str,
             {
                 "name": name,
                 "room_type": room_type,
+                "gridSize": grid_size,
                 "agent": {
                     key: start["agent"][key] for key in ("position", "rotation", "cameraHorizon")
                 },

@@ -13,11 +13,12 @@ import numpy as np
 from tdanet_jax.io import archive, files
 from tdanet_jax.io.untrusted import FileError, npz
 from tdanet_jax.scenes import cache, metadata, tabulation
-from tdanet_jax.scenes.scene import MOST_CLASSES, SceneError
+from tdanet_jax.scenes.room_names import Kinds, check_name
+from tdanet_jax.scenes.scene import MOST_CLASSES, MOST_ROOM_TYPES, SceneError
 from tdanet_jax.scenes.tables import FIELDS, SceneTables
 from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.splits import PARTS, TRAIN_SCENES_PER_TYPE, VALIDATION_TRAIN_SCENES_PER_TYPE, Split
-from tdanet_jax.vocabulary import ROOM_TYPES
+from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,8 +29,8 @@ class PublishedEpisode:
     scene: str
     x: float  # metres
     z: float
-    rotation: int  # degrees clockwise from +z, a multiple of 45
-    horizon: int  # 0 or 30 degrees down
+    rotation: int  # degrees clockwise from +z
+    horizon: int  # degrees down
     target: str
 
 
@@ -106,13 +107,19 @@ def load_rooms(path: str | Path | None, progress: Progress | None = None) -> Roo
 load = load_rooms  # its former name
 
 
-def build_rooms(scene_file: Path, progress: Progress | None = None) -> Rooms:
+def build_rooms(
+    scene_file: Path, progress: Progress | None = None, kinds: Kinds | None = None
+) -> Rooms:
     """The rooms of a scene file (JSON), see `metadata`.
+
+    Args:
+      progress: called with (rooms done, rooms in all).
+      kinds: room types and parts of the rooms for which the file does not say them.
 
     Raises:
       SceneError: the file is broken, or its rooms break a rule.
     """
-    scenes = metadata.read_scenes(scene_file)
+    scenes = metadata.read_scenes(scene_file, kinds)
     try:
         tables = tabulation.build(scenes, progress=progress)
     except SceneError as error:
@@ -141,12 +148,19 @@ def _find_problem(tables: SceneTables) -> str | None:
     sizes = {
         "R": len(tables.scenes), "P": len(tables.position), "O": len(tables.object_id),
         "N": len(tables.row_object), "S": tables.num_states, "S + 1": tables.num_states + 1,
-        "G": len(tables.targets), "C": len(tables.classes), "T": len(ROOM_TYPES),
-        "F": tables.image * tables.subpixel + 1,
+        "A": tables.grid.rotations, "G": len(tables.targets), "C": len(tables.classes),
+        "T": len(tables.room_types), "F": tables.image * tables.subpixel + 1,
     }  # fmt: skip
-    for names in (tables.scenes, tables.classes, tables.targets, tables.object_id):
+    lists = (tables.scenes, tables.classes, tables.targets, tables.object_id, tables.room_types)
+    for names in lists:
         if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
             return "names that are not text"
+    for name in (*tables.scenes, *tables.room_types):
+        check_name(name)
+    if tables.room_types[: len(ROOM_TYPES)] != ROOM_TYPES or sizes["T"] > MOST_ROOM_TYPES:
+        return f"other room types than iTHOR's come first, or there are over {MOST_ROOM_TYPES}"
+    if len(set(tables.room_types)) != sizes["T"]:
+        return "a room type that occurs twice"
     if min(sizes[letter] for letter in "RPOC") == 0 or sizes["C"] > MOST_CLASSES:
         return f"no rooms, positions, objects or classes, or over {MOST_CLASSES} classes"
     for field, (dtype, shape, low, high) in FIELDS.items():
@@ -194,14 +208,21 @@ def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
 def assign_rooms(split: Split, rooms: Rooms, validation: bool = False) -> Split:
     """The split, with the rooms for which the data say "train" or "test" in that part.
 
-    All other rooms stay where the split has them by name. With `validation`, rooms for which the
-    data say "test" are left out, and of those of a room type that say "train" the last fifth is
-    for evaluation, as with iTHOR's rooms.
+    The targets in a room type of the data's own are those target classes that its rooms hold, seen
+    and unseen as in the split. All other rooms stay where the split has them by name. With
+    `validation`, rooms for which the data say "test" are left out, and of those of a room type that
+    say "train" the last fifth is for evaluation, as with iTHOR's rooms.
     """
     tables, parts = rooms.tables, {} if rooms.extras is None else rooms.extras.parts
     train = [name for name in split.train_scenes if name not in parts]
     evaluated = [name for name in split.eval_scenes if name not in parts]
-    for kind in range(len(ROOM_TYPES)):
+    seen, unseen = dict(split.seen), dict(split.unseen)
+    left_out = {name for names in split.unseen.values() for name in names}
+    for kind, room in enumerate(tables.room_types):
+        if room not in ROOM_TYPES:
+            held = [name for name in ALL_TARGETS if name in _classes_in(tables, kind)]
+            seen[room] = tuple(name for name in held if name not in split.hidden)
+            unseen[room] = tuple(name for name in held if name in left_out)
         own = [n for n, k in zip(tables.scenes, tables.room_type, strict=True) if k == kind]
         mine = [name for name in own if parts.get(name) == "train"]
         rest = [name for name in own if parts.get(name) == "test"]
@@ -210,4 +231,16 @@ def assign_rooms(split: Split, rooms: Rooms, validation: bool = False) -> Split:
             mine, rest = mine[:first], mine[first:]
         train += mine
         evaluated += rest
-    return dataclasses.replace(split, train_scenes=tuple(train), eval_scenes=tuple(evaluated))
+    return dataclasses.replace(
+        split,
+        train_scenes=tuple(train),
+        eval_scenes=tuple(evaluated),
+        seen=seen,
+        unseen=unseen,
+    )
+
+
+def _classes_in(tables: SceneTables, room_type: int) -> set[str]:
+    """The classes of the objects in the rooms of a type."""
+    objects = tables.room_type[tables.object_scene] == room_type
+    return {tables.classes[c] for c in np.unique(tables.object_class[objects])}

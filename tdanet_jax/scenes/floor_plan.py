@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 
-from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes import ithor
 from tdanet_jax.scenes.scene import Scene, SceneError
 from tdanet_jax.scenes.tables import SceneTables
@@ -44,7 +43,8 @@ def of_scene(scene: Scene) -> FloorPlan:
     largest_first = np.argsort([-area(outlines[k]) for k in known], kind="stable")
     objects = known[largest_first]
     corners = np.concatenate([points, outlines[known].reshape(-1, 2)])
-    low, high = corners.min(axis=0) - GRID_SIZE / 2, corners.max(axis=0) + GRID_SIZE / 2
+    margin = scene.grid.grid_size / 2
+    low, high = corners.min(axis=0) - margin, corners.max(axis=0) + margin
     return FloorPlan(
         points=points,
         classes=tuple(scene.objects[k].object_class for k in objects),

@@ -63,13 +63,13 @@ def build_asset(procthor_wheel: Path, alfworld_wheel: Path, out_dir: Path) -> Pa
         metadata = json.loads(wheel.read(METADATA))
     rooms: list[dict[str, Any]] = []
     with zipfile.ZipFile(alfworld_wheel) as wheel:
-        for room_type, room in enumerate(ROOM_TYPES):
+        for room in ROOM_TYPES:
             for offset, number in enumerate(SCENE_NUMBERS[room]):
                 name = f"FloorPlan{number}"
                 layout = np.load(
                     io.BytesIO(wheel.read(LAYOUT.format(name=name))), allow_pickle=False
                 )
-                scene = _room(name, room_type, metadata[f"{room}s"][offset], layout)
+                scene = _room(name, room, metadata[f"{room}s"][offset], layout)
                 added = reachable.complete(scene.points, scene.objects)
                 rooms.append(_room_arrays(scene, added))
     scene_keys = ("name", "room_type", "default_position", "default_rotation")
@@ -93,7 +93,7 @@ def _whole(lengths: Any) -> np.ndarray:
     return np.rint(np.asarray(lengths, np.float64) / UNIT).astype(np.int32)
 
 
-def _room(name: str, room_type: int, records: list[dict[str, Any]], layout: np.ndarray) -> Scene:
+def _room(name: str, room_type: str, records: list[dict[str, Any]], layout: np.ndarray) -> Scene:
     """A room from its metadata and its published points (x, z)."""
     agent = locate_agent(records)
     grid = np.rint(layout / GRID_SIZE) * GRID_SIZE
@@ -114,7 +114,7 @@ def _room_arrays(scene: Scene, added: np.ndarray) -> dict[str, Any]:
     order = np.lexsort((points[:, 2], points[:, 0]))
     return {
         "name": scene.name.encode(),
-        "room_type": np.int8(scene.room_type),
+        "room_type": np.int8(ROOM_TYPES.index(scene.room_type)),
         "default_position": _whole(scene.default_position),
         "default_rotation": np.int16(scene.default_rotation or 0),
         "point": _whole(points[order]),
@@ -170,7 +170,7 @@ def load_scenes(path: Path | None = None) -> list[Scene]:
         scenes.append(
             Scene(
                 name=name.decode(),
-                room_type=int(data["scene_room_type"][i]),
+                room_type=ROOM_TYPES[int(data["scene_room_type"][i])],
                 points=points[i],
                 objects=tuple(
                     _object(data, row, ids[row], [ids[start + p] for p in parents[row]])

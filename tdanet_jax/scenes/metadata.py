@@ -3,12 +3,18 @@
 A scene file is JSON: a scene or a list of scenes, each an object with
 
     name                 unique in the file
-    room_type            kitchen, living_room, bedroom or bathroom
+    room_type            kitchen, living_room, bedroom, bathroom, or a type of one's own; the flags
+                         of `import` may say it instead, or the name, if it is that of an iTHOR room
     objects              controller.last_event.metadata["objects"]
-    reachable_positions  the actionReturn of GetReachablePositions, gridSize 0.25
+    reachable_positions  the actionReturn of GetReachablePositions
+    gridSize             optional, metres between neighbouring positions, 0.25 by default
+    rotateStepDegrees    optional, degrees that a turn measures, 45 by default
+    horizons             optional, degrees that the camera can look down, [0, 30] by default
     split                optional, train or test: the part of every split that the room belongs to;
-                         without it the name decides, if it is the name of an iTHOR room
+                         without it the flags of `import` decide, or the name
     agent                optional, metadata["agent"] in the same frame, to verify the flags
+
+The grid, that is gridSize, rotateStepDegrees and horizons, is the same for all scenes of a file.
 
 The fields objectId, objectType and axisAlignedBoundingBox of an object are required;
 objectOrientedBoundingBox, rotation, openable, isOpen, pickupable, parentReceptacles and visible are
@@ -27,10 +33,10 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax.poses import GRID_SIZE
+from tdanet_jax.poses import ITHOR, TURNS, PoseGrid
+from tdanet_jax.scenes.room_names import Kinds, RoomKind, check_kind, check_name
 from tdanet_jax.scenes.scene import Scene, SceneError, SceneObject
-from tdanet_jax.splits import PARTS
-from tdanet_jax.vocabulary import IGNORED, ROOM_TYPES
+from tdanet_jax.vocabulary import IGNORED
 
 ALIGNED = 0.02  # metres by which a point may miss the grid
 FARTHEST = 1000.0  # metres from the origin; a coordinate beyond this is an error
@@ -38,11 +44,12 @@ FARTHEST = 1000.0  # metres from the origin; a coordinate beyond this is an erro
 
 def parse_scene(
     name: str,
-    room_type: int,
+    room_type: str,
     records: Sequence[Mapping[str, Any]],
     points: np.ndarray,
     default_position: np.ndarray | None = None,
     default_rotation: int | None = None,
+    grid: PoseGrid = ITHOR,
 ) -> Scene:
     """A room from AI2-THOR's object records and reachable points [P, 3], which get sorted.
 
@@ -56,26 +63,28 @@ def parse_scene(
     identity, times = Counter(item.object_id for item in objects).most_common(1)[0]
     if times > 1:
         raise SceneError(f"{name}: {identity}: id occurs {times} times")
-    points = check_points(name, points)
-    return Scene(name, room_type, points, tuple(objects), default_position, default_rotation)
+    points = check_points(name, points, grid.grid_size)
+    return Scene(
+        name, room_type, points, tuple(objects), default_position, default_rotation, grid=grid
+    )
 
 
-def check_points(name: str, points: np.ndarray) -> np.ndarray:
+def check_points(name: str, points: np.ndarray, size: float = ITHOR.grid_size) -> np.ndarray:
     """Reachable points [P, 3], sorted by (x, z) and without duplicates.
 
     Raises:
-      SceneError: there are none, or they are not on a grid of 0.25 m.
+      SceneError: there are none, or they are not on a grid of `size` metres.
     """
     if len(points) == 0:
         raise SceneError(f"{name}: no reachable position")
     if not np.isfinite(points).all() or np.abs(points).max() > FARTHEST:
         raise SceneError(f"{name}: a reachable position is not finite or over {FARTHEST:.0f} m")
-    steps = (points - points[0])[:, [0, 2]] / GRID_SIZE
-    off = np.abs(steps - np.rint(steps)).max(axis=1) * GRID_SIZE
+    steps = (points - points[0])[:, [0, 2]] / size
+    off = np.abs(steps - np.rint(steps)).max(axis=1) * size
     if off.max() > ALIGNED:
         x, _, z = points[off.argmax()]
         raise SceneError(
-            f"{name}: reachable position x {x:.3f}, z {z:.3f}: off the {GRID_SIZE} m grid"
+            f"{name}: reachable position x {x:.3f}, z {z:.3f}: off the {size:g} m grid"
         )
     _, first = np.unique(np.rint(steps), axis=0, return_index=True)
     return points[first]
@@ -152,8 +161,11 @@ def _corners(scene: str, name: str, oriented: Any) -> np.ndarray:
     return np.array(points, np.float64)
 
 
-def read_scenes(path: Path) -> list[Scene]:
+def read_scenes(path: Path, kinds: Kinds | None = None) -> list[Scene]:
     """The rooms of a scene file.
+
+    Args:
+      kinds: room types and parts of the rooms for which the file does not say them.
 
     Raises:
       SceneError: it is not such a file, or a scene breaks a rule.
@@ -165,44 +177,90 @@ def read_scenes(path: Path) -> list[Scene]:
     documents = content if isinstance(content, list) else [content]
     if not documents:
         raise SceneError(f"{path}: no scenes")
-    scenes = [_read_scene(path, document) for document in documents]
+    kinds = kinds or Kinds()
+    names = [document.get("name") for document in documents if isinstance(document, Mapping)]
+    if unknown := [name for name in kinds.table if name not in names]:
+        raise SceneError(f"{path}: no room is called {unknown[0]}, which --rooms lists")
+    scenes = [_read_scene(path, document, kinds) for document in documents]
     name, times = Counter(scene.name for scene in scenes).most_common(1)[0]
     if times > 1:
         raise SceneError(f"{path}: {name}: name occurs {times} times")
+    for scene in scenes:
+        if scene.grid != scenes[0].grid:
+            raise SceneError(
+                f"{path}: {scene.name}: another gridSize, rotateStepDegrees or horizons than "
+                f"{scenes[0].name}; they must be the same for all scenes of a file"
+            )
     return scenes
 
 
-def _read_scene(path: Path, document: Any) -> Scene:
+def _read_scene(path: Path, document: Any, kinds: Kinds) -> Scene:
     if not isinstance(document, Mapping) or not isinstance(document.get("name"), str):
         raise SceneError(f"{path}: a scene without a name")
     name = document["name"]
-    if document.get("room_type") not in ROOM_TYPES:
-        raise SceneError(f"{name}: room_type {document.get('room_type')!r}, not {ROOM_TYPES}")
+    check_name(name, f"{path}: room name")
+    room_type, part = _kind(path, name, document, kinds)
     for key in ("objects", "reachable_positions"):
         if not isinstance(document.get(key), list):
             raise SceneError(f"{name}: {key} is not a list")
-    if document.get("split") not in (None, *PARTS):
-        raise SceneError(f"{name}: split {document['split']!r}, not {' or '.join(PARTS)}")
     points = [
         _vector(name, f"reachable_positions[{i}]", {"position": point}, "position")
         for i, point in enumerate(document["reachable_positions"])
     ]
+    grid = _grid(name, document)
     position, rotation = None, None
     if document.get("agent") is not None:
-        position, rotation = _agent(name, document["agent"])
+        position, rotation = _agent(name, document["agent"], grid)
     scene = parse_scene(
         name,
-        ROOM_TYPES.index(document["room_type"]),
+        room_type,
         document["objects"],
         np.reshape(points, (-1, 3)),
         position,
         rotation,
+        grid,
     )
-    return dataclasses.replace(scene, part=document.get("split"))
+    return dataclasses.replace(scene, part=part)
 
 
-def _agent(scene: str, agent: Any) -> tuple[np.ndarray | None, int | None]:
-    """Position and rotation of an agent that looks level along an axis or diagonal, or None."""
+def _kind(
+    path: Path, name: str, document: Mapping[str, Any], kinds: Kinds
+) -> tuple[str, str | None]:
+    """Room type and part of a scene."""
+    said = RoomKind(document.get("room_type"), document.get("split"))
+    try:
+        check_kind(said)
+    except SceneError as error:
+        raise SceneError(f"{name}: {error}") from None
+    room_type, part = kinds.of(name, said)
+    if room_type is None:
+        raise SceneError(
+            f'{path}: {name}: no room type; give it in the file ("room_type"), or import the file '
+            "with --room-type or --rooms"
+        )
+    return room_type, part
+
+
+def _grid(scene: str, document: Mapping[str, Any]) -> PoseGrid:
+    """The grid that a scene's fields describe."""
+    turn, horizons = document.get("rotateStepDegrees"), document.get("horizons")
+    if turn is not None and turn not in TURNS:
+        raise SceneError(f"{scene}: rotateStepDegrees {turn!r}, not one of {list(TURNS)}")
+    if horizons is not None and not isinstance(horizons, list):
+        raise SceneError(f"{scene}: horizons is not a list")
+    given: dict[str, Any] = {
+        "grid_size": document.get("gridSize"),
+        "rotations": turn and 360 // int(turn),
+        "horizons": horizons and tuple(horizons),
+    }
+    try:
+        return PoseGrid(**{name: value for name, value in given.items() if value is not None})
+    except ValueError as error:
+        raise SceneError(f"{scene}: {error}") from None
+
+
+def _agent(scene: str, agent: Any, grid: PoseGrid) -> tuple[np.ndarray | None, int | None]:
+    """Position and rotation of an agent that looks level along one of the headings, or None."""
     if not isinstance(agent, Mapping):
         raise SceneError(f"{scene}: agent is not metadata's agent record")
     position = _vector(scene, "agent", agent, "position")
@@ -210,6 +268,6 @@ def _agent(scene: str, agent: Any) -> tuple[np.ndarray | None, int | None]:
     horizon = agent.get("cameraHorizon", 0.0)
     if not _is_number(horizon):
         raise SceneError(f"{scene}: agent: cameraHorizon is not a number")
-    if abs(horizon) > 1 or abs((turn + 22.5) % 45 - 22.5) > 1:
+    if abs(horizon) > 1 or abs((turn + grid.turn / 2) % grid.turn - grid.turn / 2) > 1:
         return None, None
-    return position, round(turn / 45) * 45 % 360
+    return position, round(turn / grid.turn) * grid.turn % 360

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from typing import NamedTuple
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes.scene import SceneError
 from tdanet_jax.splits import PARTS, SCENE_NUMBERS, TRAIN_SCENES_PER_TYPE
-from tdanet_jax.vocabulary import ROOM_TYPES
+from tdanet_jax.vocabulary import ROOM_TYPES, class_words
 
 #: Bytes of UTF-8: names of rooms become names of files.
 LONGEST_NAME = 200
@@ -23,13 +23,16 @@ _ITHOR = re.compile(r"FloorPlan([1-9][0-9]{0,2})(?![0-9])")
 
 
 class RoomKind(NamedTuple):
-    """What kind of room a room is."""
+    """What kind of room a room is; None what is not known."""
 
-    room_type: int  # index into vocabulary.ROOM_TYPES
-    part: str | None  # "train" or "test" in every split; None: the split decides by the name
+    room_type: str | None = None
+    part: str | None = None  # "train" or "test" in every split; None: the split decides by the name
 
 
-def check_name(name: str) -> None:
+UNKNOWN = RoomKind()
+
+
+def check_name(name: str, what: str = "room name") -> None:
     """Accepts any name that is safe as the name of a file or folder and on a terminal.
 
     Raises:
@@ -38,14 +41,28 @@ def check_name(name: str) -> None:
     """
     shown = "".join(c if c.isprintable() else "?" for c in name[:40])
     if not name.isprintable():
-        raise SceneError(f"room name {shown!r}: has a control character")
+        raise SceneError(f"{what} {shown!r}: has a control character")
     if any(separator in name for separator in "/\\:") or name in (".", ".."):
-        raise SceneError(f"room name {shown!r}: is a path, not a plain name")
+        raise SceneError(f"{what} {shown!r}: is a path, not a plain name")
     if not name or name != name.strip() or len(name.encode()) > LONGEST_NAME:
         raise SceneError(
-            f"room name {shown!r}: empty, longer than {LONGEST_NAME} bytes, or with a space at "
+            f"{what} {shown!r}: empty, longer than {LONGEST_NAME} bytes, or with a space at "
             "its start or end"
         )
+
+
+def check_kind(kind: RoomKind) -> None:
+    """Raises SceneError if a room type cannot be one, or a part is neither train nor test."""
+    room_type, part = kind
+    if room_type is not None:
+        if not isinstance(room_type, str):
+            raise SceneError(f"room_type {room_type!r}: not a name")
+        check_name(room_type, "room_type")
+        for known in ROOM_TYPES:
+            if room_type != known and class_words(room_type) == class_words(known):
+                raise SceneError(f"room_type {room_type!r}: did you mean {known}?")
+    if part not in (None, *PARTS):
+        raise SceneError(f"part {part!r}, not {' or '.join(PARTS)}")
 
 
 def kind_of(name: str) -> RoomKind | None:
@@ -59,29 +76,39 @@ def kind_of(name: str) -> RoomKind | None:
     if match is None:
         return None
     number = int(match[1])
-    for room_type, room in enumerate(ROOM_TYPES):
+    for room in ROOM_TYPES:
         if number in SCENE_NUMBERS[room]:
             trains = SCENE_NUMBERS[room].index(number) < TRAIN_SCENES_PER_TYPE
             part = PARTS[0] if trains else PARTS[1]
-            return RoomKind(room_type, None if match[0] == name else part)
+            return RoomKind(room, None if match[0] == name else part)
     return None
 
 
 @dataclass(frozen=True)
 class Kinds:
-    """The kinds of rooms: by a table, otherwise by name, otherwise all the same.
+    """What a user says of rooms in addition to their files.
 
     Attributes:
-      table: from `read_table`.
-      other: the kind of rooms that are not in the table and whose name says nothing.
+      table: kinds by name, from `read_table`.
+      other: the kind of rooms whose name says nothing.
     """
 
     table: Mapping[str, RoomKind] = field(default_factory=dict)
-    other: RoomKind | None = None
+    other: RoomKind = UNKNOWN
 
-    def of(self, name: str) -> RoomKind | None:
-        """The kind of a room, or None if nothing says it."""
-        return self.table.get(name) or kind_of(name) or self.other
+    def of(self, name: str, said: RoomKind = UNKNOWN) -> RoomKind:
+        """A room's type and part: each as the room's file says it, otherwise the table, otherwise
+        the name, or `other` if the name says nothing."""
+        listed, rest = self.table.get(name, UNKNOWN), kind_of(name) or self.other
+        return RoomKind(
+            said.room_type or listed.room_type or rest.room_type,
+            said.part or listed.part or rest.part,
+        )
+
+
+def type_names(names: Iterable[str]) -> tuple[str, ...]:
+    """iTHOR's room types, then the others among `names`, sorted."""
+    return (*ROOM_TYPES, *sorted(set(names) - set(ROOM_TYPES)))
 
 
 def sort_key(name: str) -> tuple[tuple[bool, int, str], ...]:
@@ -95,7 +122,7 @@ def sort_key(name: str) -> tuple[tuple[bool, int, str], ...]:
 def read_table(path: Path) -> dict[str, RoomKind]:
     """Name -> kind of the rooms in a CSV file with the columns name, room_type and part.
 
-    The part may be empty, and its column missing: the room then belongs to neither part.
+    Cells may be empty, and the columns of type or part missing: the table then says nothing of it.
 
     Raises:
       FileError: it is not such a table; the message names line and column.
@@ -111,7 +138,7 @@ def read_table(path: Path) -> dict[str, RoomKind]:
     except (UnicodeDecodeError, csv.Error) as error:
         raise FileError(path, f"not a CSV table ({error})") from None
     header = lines[0][1] if lines else []
-    if len(set(header)) != len(header) or not {*COLUMNS[:2]} <= set(header) <= {*COLUMNS}:
+    if len(set(header)) != len(header) or not {"name"} <= set(header) <= {*COLUMNS}:
         raise FileError(path, f"line 1: the columns are not {', '.join(COLUMNS)}")
     table: dict[str, RoomKind] = {}
     for number, cells in lines[1:]:
@@ -120,17 +147,13 @@ def read_table(path: Path) -> dict[str, RoomKind]:
         if len(cells) != len(header):
             raise FileError(path, f"line {number}: {len(cells)} columns, not {len(header)}")
         row = dict(zip(header, cells, strict=True))
+        kind = RoomKind(row.get("room_type") or None, row.get("part") or None)
         try:
             check_name(row["name"])
+            check_kind(kind)
         except SceneError as error:
             raise FileError(path, f"line {number}: {error}") from None
         if row["name"] in table:
             raise FileError(path, f"line {number}: {row['name']} is listed twice")
-        if row["room_type"] not in ROOM_TYPES:
-            types = ", ".join(ROOM_TYPES)
-            raise FileError(path, f"line {number}: room_type {row['room_type']!r}, not {types}")
-        part = row.get("part") or None
-        if part not in (None, *PARTS):
-            raise FileError(path, f"line {number}: part {part!r}, not {' or '.join(PARTS)}")
-        table[row["name"]] = RoomKind(ROOM_TYPES.index(row["room_type"]), part)
+        table[row["name"]] = kind
     return table

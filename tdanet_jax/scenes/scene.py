@@ -6,7 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tdanet_jax.poses import ITHOR, PoseGrid
+
 MOST_CLASSES = 127  # in all rooms together: the raster stores a class as int8
+MOST_ROOM_TYPES = 127  # in all rooms together: the tables store a type as int8
 SUBPIXEL = 16  # boxes are stored in sixteenths of a pixel
 CAMERA_ABOVE_AGENT = 0.675  # metres from the agent's y to its camera, AI2-THOR's default agent
 
@@ -40,9 +43,10 @@ class Scene:
     """A room: where an agent can stand, and the objects around it."""
 
     name: str
-    room_type: int  # index into vocabulary.ROOM_TYPES
+    room_type: str  # one of vocabulary.ROOM_TYPES, or a type of its own
     points: np.ndarray  # [P, 3] float64, reachable agent positions; metres
     objects: tuple[SceneObject, ...]  # sorted by (class, id)
     default_position: np.ndarray | None = None  # [3] float64, agent in the metadata's frame
     default_rotation: int | None = None  # degrees clockwise from +z, horizon 0
     part: str | None = None  # "train" or "test" in every split; None if the name decides
+    grid: PoseGrid = ITHOR

@@ -1,7 +1,7 @@
 """Scene tables: everything that an agent's world consists of, for all rooms one after the other.
 
-Axes: R scenes, P positions, S = P * 16 states, C classes, G targets, N detection rows,
-O objects. The index of a state is that of its pose, see poses.py.
+Axes: R scenes, P positions, S states (P times the grid's views), C classes, G targets, N detection
+rows, O objects. The index of a state is that of its pose, see poses.py.
 """
 
 from __future__ import annotations
@@ -9,27 +9,27 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tdanet_jax import poses
 from tdanet_jax.io import archive
 from tdanet_jax.io.untrusted import npz
-from tdanet_jax.poses import VIEWS
+from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene, SceneError, SceneObject
-from tdanet_jax.vocabulary import FIELD_OF_VIEW, IMAGE_SIZE
+from tdanet_jax.vocabulary import FIELD_OF_VIEW, IMAGE_SIZE, ROOM_TYPES
 
 #: Field -> dtype, shape, least value, and the axis that its values are indices of. In addition to
-#: the axes above, T are the room types and F the units of `row_box` along the image.
+#: the axes above, T are the room types, A the rotations and F the units of `row_box` along the
+#: image.
 FIELDS: dict[str, tuple[str, tuple[Any, ...], int, str]] = {
     "room_type": ("int8", ("R",), 0, "T"),
     "position": ("float64", ("P", 3), 0, ""),
     "position_scene": ("int16", ("P",), 0, "R"),
-    "next_position": ("int32", ("P", 8), 0, "P"),
+    "next_position": ("int32", ("P", "A"), 0, "P"),
     "row_start": ("int32", ("S + 1",), 0, ""),
     "row_object": ("int32", ("N",), 0, "O"),
     "row_box": ("int16", ("N", 4), -1, "F"),
@@ -40,6 +40,8 @@ FIELDS: dict[str, tuple[str, tuple[Any, ...], int, str]] = {
     "distance": ("int16", ("S", "G"), 0, ""),
     "raster": ("int8", ("S", 7, 7), -1, "C"),
 }
+#: Fields that the first tables did not have.
+_LATER = {"grid", "room_types"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -50,10 +52,10 @@ class SceneTables:
     classes: tuple[str, ...]  # C names, sorted
     targets: tuple[str, ...]  # G names
     object_id: tuple[str, ...]  # O names, unique within a scene
-    room_type: np.ndarray  # [R] int8, index into vocabulary.ROOM_TYPES
+    room_type: np.ndarray  # [R] int8, index into `room_types`
     position: np.ndarray  # [P, 3] float64, agent's x, y, z in metres
     position_scene: np.ndarray  # [P] int16, nondecreasing
-    next_position: np.ndarray  # [P, 8] int32, where MoveAhead leads; itself when blocked
+    next_position: np.ndarray  # [P, rotations] int32, where MoveAhead leads; itself when blocked
     row_start: np.ndarray  # [S + 1] int32, rows of state s are row_start[s]:row_start[s + 1]
     row_object: np.ndarray  # [N] int32, index of the object; by (class, object) in a state
     row_box: np.ndarray  # [N, 4] int16, x1, y1, x2, y2 in sixteenths of a pixel, y down;
@@ -68,11 +70,13 @@ class SceneTables:
     camera_height: float = CAMERA_ABOVE_AGENT  # metres above the agent's y
     image: int = IMAGE_SIZE  # pixels, width and height of the frame
     subpixel: int = SUBPIXEL  # units of row_box in a pixel
+    grid: PoseGrid = ITHOR  # the poses at a position, and the steps between positions
+    room_types: tuple[str, ...] = ROOM_TYPES  # T names: iTHOR's four, then others, sorted
 
     @property
     def num_states(self) -> int:
         """S, the number of states."""
-        return len(self.position) * VIEWS
+        return len(self.position) * self.grid.views
 
     @cached_property
     def row_class(self) -> np.ndarray:
@@ -88,12 +92,12 @@ class SceneTables:
     @property
     def state_scene(self) -> np.ndarray:
         """Scene of each state: [S] int16."""
-        return np.repeat(self.position_scene, VIEWS)
+        return np.repeat(self.position_scene, self.grid.views)
 
     @property
     def reachable(self) -> np.ndarray:
         """Whether a target can be reached from a position: [P, G] bool."""
-        return self.distance[poses.join(np.arange(len(self.position)))] >= 0
+        return self.distance[self.grid.look_level(np.arange(len(self.position)))] >= 0
 
     def visible_bits(self) -> np.ndarray:
         """Classes visible in each state: [S, ceil(C / 32)] uint32, class c is bit c % 32."""
@@ -106,30 +110,38 @@ class SceneTables:
         """The state at a scene's reachable point nearest to (x, z) metres.
 
         Raises:
-          SceneError: rotation is not a multiple of 45, or horizon is neither 0 nor 30.
+          ValueError: the grid has no such rotation or horizon.
         """
-        if rotation % 45:
-            raise SceneError(f"rotation {rotation}: not a multiple of 45 degrees")
-        if horizon not in (0, 30):
-            raise SceneError(f"horizon {horizon}: neither 0 nor 30 degrees")
+        view = self.grid.nearest_view(rotation, horizon)
         here = np.flatnonzero(self.position_scene == scene)
         offset = self.position[here][:, [0, 2]] - (x, z)
         position = int(here[(offset**2).sum(axis=1).argmin()])
-        return poses.from_degrees(position, rotation, horizon)
+        return self.grid.join(position, *view)
 
     @cached_property
     def data_version(self) -> str:
         """First 12 hex digits of the sha256 of all fields."""
         digest = hashlib.sha256()
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
+        for name, value in self._stored():
             if isinstance(value, np.ndarray):
                 plain = np.ascontiguousarray(value.astype(value.dtype.newbyteorder("<")))
-                digest.update(f"{field.name}{plain.dtype}{plain.shape}".encode())
+                digest.update(f"{name}{plain.dtype}{plain.shape}".encode())
                 digest.update(plain.data)
             else:
-                digest.update(f"{field.name}{json.dumps(value)}".encode())
+                digest.update(f"{name}{json.dumps(value)}".encode())
         return digest.hexdigest()[:12]
+
+    def _stored(self) -> Iterator[tuple[str, Any]]:
+        """The fields as arrays and as plain values for JSON.
+
+        Without those of `_LATER` that have their defaults, so that the tables of iTHOR's rooms are
+        the same as before there were such fields.
+        """
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name not in _LATER or value != field.default:
+                plain = dataclasses.is_dataclass(value) and not isinstance(value, type)
+                yield field.name, dataclasses.asdict(value) if plain else value
 
     def subset(self, names: Iterable[str]) -> SceneTables:
         """The tables of the named scenes only, in the order of these tables.
@@ -143,7 +155,8 @@ class SceneTables:
         scenes = np.array([name in wanted for name in self.scenes])
         positions, objects = scenes[self.position_scene], scenes[self.object_scene]
         kept = {
-            "R": scenes, "P": positions, "S": np.repeat(positions, VIEWS), "O": objects,
+            "R": scenes, "P": positions, "S": np.repeat(positions, self.grid.views),
+            "O": objects,
             "N": objects[self.row_object],
         }  # fmt: skip
         arrays: dict[str, Any] = {
@@ -173,7 +186,13 @@ class SceneTables:
             SceneObject(name, self.classes[self.object_class[i]], box.reshape(2, 3))
             for i, (name, box) in enumerate(zip(self.object_id, self.object_box, strict=True))
         )
-        return Scene(self.scenes[0], int(self.room_type[0]), self.position, objects)
+        return Scene(
+            self.scenes[0],
+            self.room_types[self.room_type[0]],
+            self.position,
+            objects,
+            grid=self.grid,
+        )
 
     def save(self, path: Path) -> None:
         """Writes the tables as a compressed npz without pickles."""
@@ -188,12 +207,11 @@ class SceneTables:
         """All fields as named arrays; fields that are not arrays go into `rest`, as JSON."""
         arrays: dict[str, np.ndarray] = {}
         rest: dict[str, object] = {}
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
+        for name, value in self._stored():
             if isinstance(value, np.ndarray):
-                arrays[field.name] = value
+                arrays[name] = value
             else:
-                rest[field.name] = value
+                rest[name] = value
         arrays["rest"] = np.frombuffer(json.dumps(rest).encode(), np.uint8)
         return arrays
 
@@ -205,6 +223,9 @@ class SceneTables:
         fields: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in rest.items()
         }
+        if "grid" in fields:
+            values = fields["grid"]
+            fields["grid"] = PoseGrid(**values | {"horizons": tuple(values["horizons"])})
         return cls(**own, **fields)
 
 

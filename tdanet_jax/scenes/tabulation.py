@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax.poses import VIEWS
-from tdanet_jax.scenes.scene import MOST_CLASSES, SUBPIXEL, Scene, SceneError
+from tdanet_jax.scenes.room_names import type_names
+from tdanet_jax.scenes.scene import MOST_CLASSES, MOST_ROOM_TYPES, SUBPIXEL, Scene, SceneError
 from tdanet_jax.scenes.tables import FIELDS, SceneTables, row_offsets
 from tdanet_jax.scenes.visibility.build import Detections, detect
 from tdanet_jax.scenes.visibility.geometry import action_distances, next_positions, transitions
@@ -40,13 +40,16 @@ def build(
       classes: the vocabulary; by default the classes that occur, sorted.
 
     Raises:
-      SceneError: there are more classes than the raster can number, or `classes` lacks one.
+      SceneError: there are more classes or room types than the tables can number, or `classes`
+        lacks one.
     """
     if classes is None:
         classes = sorted({item.object_class for scene in scenes for item in scene.objects})
     names = tuple(classes)
     if len(names) > MOST_CLASSES:
         raise SceneError(f"{len(names)} classes, more than {MOST_CLASSES}")
+    if len(type_names(scene.room_type for scene in scenes)) > MOST_ROOM_TYPES:
+        raise SceneError(f"more than {MOST_ROOM_TYPES} room types")
 
     def build_room(scene: Scene) -> SceneTables:
         for item in scene.objects:
@@ -54,7 +57,8 @@ def build(
                 raise SceneError(
                     f"{scene.name}: {item.object_id}: class {item.object_class} is not known"
                 )
-        return tabulate(scene, next_positions(scene.points), detect(scene, rules), targets)
+        ahead = next_positions(scene.points, scene.grid)
+        return tabulate(scene, ahead, detect(scene, rules), targets)
 
     rooms = []
     with ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, MOST_WORKERS)) as pool:
@@ -71,12 +75,13 @@ def tabulate(
     """The tables of one room, with its own classes.
 
     Args:
-      next_position: [P, 8] int32, the position after MoveAhead along each heading.
+      next_position: [P, rotations] int32, the position after MoveAhead along each heading.
     """
     classes = sorted({item.object_class for item in scene.objects})
+    room_types = type_names([scene.room_type])
     object_class = np.array([classes.index(o.object_class) for o in scene.objects], np.int16)
     row_class = object_class[detections.owner]
-    states = len(scene.points) * VIEWS
+    states = len(scene.points) * scene.grid.views
     goals = np.zeros((states, len(targets)), bool)
     for g, target in enumerate(targets):
         if target in classes:
@@ -87,7 +92,7 @@ def tabulate(
         classes=tuple(classes),
         targets=tuple(targets),
         object_id=tuple(item.object_id for item in scene.objects),
-        room_type=np.array([scene.room_type], np.int8),
+        room_type=np.array([room_types.index(scene.room_type)], np.int8),
         position=scene.points,
         position_scene=np.zeros(len(scene.points), np.int16),
         next_position=next_position,
@@ -98,8 +103,10 @@ def tabulate(
         object_class=object_class,
         object_scene=np.zeros(len(scene.objects), np.int16),
         object_box=np.array([item.box.reshape(6) for item in scene.objects]),
-        distance=action_distances(transitions(next_position), goals),
+        distance=action_distances(transitions(next_position, scene.grid), goals),
         raster=paint(detections.state, detections.box, row_class, states, IMAGE_SIZE * SUBPIXEL),
+        grid=scene.grid,
+        room_types=room_types,
     )
 
 
@@ -139,6 +146,7 @@ def paint(
 
 def join(rooms: Sequence[SceneTables], classes: Sequence[str]) -> SceneTables:
     """The tables of all rooms, one after the other; `classes` includes those of every room."""
+    room_types = type_names(name for room in rooms for name in room.room_types)
     parts: dict[str, list[np.ndarray]] = {field: [] for field in FIELDS}
     first = {"R": 0, "P": 0, "O": 0}
     for room in rooms:
@@ -149,6 +157,8 @@ def join(rooms: Sequence[SceneTables], classes: Sequence[str]) -> SceneTables:
                 value = np.diff(value)
             elif indexed == "C":
                 value = number[value]  # -1 stays -1
+            elif indexed == "T":
+                value = np.array([*map(room_types.index, room.room_types)])[value]
             parts[field].append(value + first[indexed] if indexed in first else value)
         sizes = {"R": len(room.scenes), "P": len(room.position), "O": len(room.object_id)}
         first = {axis: first[axis] + sizes[axis] for axis in first}
@@ -160,6 +170,7 @@ def join(rooms: Sequence[SceneTables], classes: Sequence[str]) -> SceneTables:
         rooms[0],
         scenes=tuple(name for room in rooms for name in room.scenes),
         classes=tuple(classes),
+        room_types=room_types,
         object_id=tuple(name for room in rooms for name in room.object_id),
         **arrays,
     )

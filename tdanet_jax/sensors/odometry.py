@@ -8,6 +8,8 @@ around the agent, rotated so that ahead is up.
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,49 +18,50 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from tdanet_jax.poses import ROTATIONS, STEPS
+from tdanet_jax.poses import ITHOR, STEPS, PoseGrid, modulo
 from tdanet_jax.sensors.sensor import Motion, Sensor, Start
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action
 
-#: Cells of 0.25 m along each side of the map, which wraps around like a torus. The largest iTHOR
+#: Cells of the grid along each side of the map, which wraps around like a torus. The largest iTHOR
 #: room has 35.
 MAP_SIZE = 64
 #: Cells along each side of the part of the map that is read, the agent in its middle.
 WINDOW = 9
-#: Bits of a cell: one for each heading in which the agent stood there, then "blocked".
-BLOCKED = 1 << ROTATIONS
-#: Positions are divided by this many cells (4 m).
-POSITION_SCALE = 16.0
+#: A heading counts as that of the eight directions that is nearest to it.
+DIRECTIONS = len(STEPS)
+#: Bits of a cell: one for each direction in which the agent stood there, then "blocked".
+BLOCKED = 1 << DIRECTIONS
+#: Positions are divided by this many metres.
+POSITION_SCALE = 4.0
 
 
-def _window_offsets() -> np.ndarray:
-    """The cells of the window, [8, WINDOW, WINDOW, 2], by heading: the first row is far ahead.
+@functools.cache
+def _window_offsets(rotations: int) -> np.ndarray:
+    """The cells of the window, [rotations, WINDOW, WINDOW, 2]: the first row is far ahead.
 
-    Along a diagonal these are the cells nearest to a square that is rotated by 45 degrees: some
-    cells occur twice, and some not at all.
+    Off the axes these are the cells nearest to a square that is rotated: some cells occur twice,
+    and some not at all.
     """
     middle = WINDOW // 2
     row, column = np.mgrid[:WINDOW, :WINDOW]
     right, ahead = column - middle, middle - row
-    angle = np.arange(ROTATIONS)[:, None, None] * (np.pi / 4)
+    angle = np.arange(rotations)[:, None, None] * (2 * np.pi / rotations)
     x = right * np.cos(angle) + ahead * np.sin(angle)
     z = ahead * np.cos(angle) - right * np.sin(angle)
     return np.rint(np.stack([x, z], axis=-1)).astype(np.int32)
 
 
-OFFSETS = _window_offsets()
-
-
 class OdometryState(struct.PyTreeNode):
     """The agent's pose and map in one episode, in a frame whose origin is the start.
 
-    The axes lie along the grid of reachable points: z is the start's heading, or for a start along
-    a diagonal, the axis 45 degrees to its left.
+    The axes lie along the grid of reachable points: z is the start's heading, or for a start
+    between two axes, the next one to its left (with turns of 60 degrees, the next that turns lead
+    to).
     """
 
     cell: jax.Array  # [2] int32, x and z in cells
-    heading: jax.Array  # int32, in steps of 45 degrees clockwise from z
-    horizon: jax.Array  # int32, 1 while looking down
+    heading: jax.Array  # int32, turns clockwise from z
+    horizon: jax.Array  # int32, its index
     action: jax.Array  # int32, the last action; 6 before the first
     blocked: jax.Array  # bool, the last action was a MoveAhead that did not move the agent
     cells: jax.Array  # [MAP_SIZE, MAP_SIZE] uint16, the bits of each cell
@@ -68,7 +71,8 @@ class OdometryReading(struct.PyTreeNode):
     """What odometry says."""
 
     #: [12] float32: position to the right and ahead of the start as the agent faces now, in units
-    #: of 4 m; sine and cosine of its heading; horizon; whether it was blocked; the last action.
+    #: of 4 m; sine and cosine of its heading; horizon, in units of 30 degrees; whether it was
+    #: blocked; the last action.
     motion: jax.Array
     window: jax.Array  # [WINDOW, WINDOW] uint16, the map around it; headings relative to its own
 
@@ -76,11 +80,11 @@ class OdometryReading(struct.PyTreeNode):
 class Odometry(Sensor):
     """Dead reckoning: exact, as the world has no slip."""
 
-    width = 6 + NUM_ACTIONS + WINDOW * WINDOW * (ROTATIONS + 1)
+    width = 6 + NUM_ACTIONS + WINDOW * WINDOW * (DIRECTIONS + 1)
 
     def init(self, start: Start) -> OdometryState:
-        """At the origin; only whether the start is along a diagonal of the grid matters."""
-        heading = start.rotation & 1
+        """At the origin; of the rotation, only how it lies to the axes of the grid matters."""
+        heading = modulo(start.rotation, math.lcm(self.grid.turn, 90) // self.grid.turn)
         cells = jnp.zeros((MAP_SIZE, MAP_SIZE), jnp.uint16)
         return OdometryState(
             cell=jnp.zeros(2, jnp.int32),
@@ -88,21 +92,21 @@ class Odometry(Sensor):
             horizon=start.horizon,
             action=jnp.full_like(heading, NUM_ACTIONS),
             blocked=jnp.zeros_like(heading, bool),
-            cells=cells.at[0, 0].set((1 << heading).astype(jnp.uint16)),
+            cells=cells.at[0, 0].set((1 << self.grid.neighbour(heading)).astype(jnp.uint16)),
         )
 
     def update(
         self, state: OdometryState, motion: Motion, others: Mapping[str, Any]
     ) -> OdometryState:
         """Moves on by an action, and marks one cell of the map."""
-        ahead = state.cell + jnp.asarray(STEPS)[state.heading]
+        ahead = state.cell + jnp.asarray(self.grid.steps)[state.heading]
         moves = motion.action == Action.MOVE_AHEAD
         blocked = moves & motion.blocked
         cell = jnp.where(moves & ~blocked, ahead, state.cell)
-        heading, horizon = turn(state.heading, state.horizon, motion.action)
+        heading, horizon = turn(self.grid, state.heading, state.horizon, motion.action)
         # One cell changes: the one in the way, or the one where the agent stands.
         changed = jnp.where(blocked, ahead, cell) & (MAP_SIZE - 1)
-        bit = jnp.where(blocked, BLOCKED, 1 << heading).astype(jnp.uint16)
+        bit = jnp.where(blocked, BLOCKED, 1 << self.grid.neighbour(heading)).astype(jnp.uint16)
         at = changed[0], changed[1]
         return OdometryState(
             cell=cell,
@@ -116,15 +120,18 @@ class Odometry(Sensor):
     def read(self, state: OdometryState, others: Mapping[str, Any]) -> OdometryReading:
         """The pose relative to the start, and the map around the agent."""
         heading = state.heading
-        angle = heading * (jnp.pi / 4)
+        angle = heading * (2 * jnp.pi / self.grid.rotations)
         sine, cosine = jnp.sin(angle), jnp.cos(angle)
-        x, z = state.cell / POSITION_SCALE
+        x, z = state.cell / (POSITION_SCALE / self.grid.grid_size)
         right, ahead = x * cosine - z * sine, x * sine + z * cosine
-        motion = jnp.stack([right, ahead, sine, cosine, state.horizon, state.blocked])
-        around = (state.cell + jnp.asarray(OFFSETS)[heading]) & (MAP_SIZE - 1)
+        down = tilt(self.grid, state.horizon)
+        motion = jnp.stack([right, ahead, sine, cosine, down, state.blocked])
+        offsets = _window_offsets(self.grid.rotations)
+        around = (state.cell + jnp.asarray(offsets)[heading]) & (MAP_SIZE - 1)
         bits = state.cells[around[..., 0], around[..., 1]].astype(jnp.int32)
         stood = bits & (BLOCKED - 1)
-        turned = ((stood >> heading) | (stood << (ROTATIONS - heading))) & (BLOCKED - 1)
+        own = self.grid.neighbour(heading)
+        turned = ((stood >> own) | (stood << (DIRECTIONS - own))) & (BLOCKED - 1)
         return OdometryReading(
             motion=jnp.concatenate([motion, jax.nn.one_hot(state.action, NUM_ACTIONS)]),
             window=(turned | bits & BLOCKED).astype(jnp.uint16),
@@ -132,7 +139,7 @@ class Odometry(Sensor):
 
     def features(self, reading: OdometryReading) -> jax.Array:
         """The motion, then the bits of the window: [..., width]."""
-        bits = reading.window[..., None] >> jnp.arange(ROTATIONS + 1, dtype=jnp.uint16) & 1
+        bits = reading.window[..., None] >> jnp.arange(DIRECTIONS + 1, dtype=jnp.uint16) & 1
         flat = bits.reshape(*bits.shape[:-3], -1)
         return jnp.concatenate([reading.motion, flat.astype(jnp.float32)], axis=-1)
 
@@ -142,16 +149,30 @@ def make() -> Odometry:
     return Odometry()
 
 
-def turn(heading: jax.Array, horizon: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Heading (0 to 7) and horizon (0 or 1) after an action."""
+def turn(
+    grid: PoseGrid, heading: jax.Array, horizon: jax.Array, action: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Heading and horizon after an action, which moves each by at most one."""
     right = jnp.where(action == Action.ROTATE_RIGHT, 1, 0)
     right = jnp.where(action == Action.ROTATE_LEFT, -1, right)
-    horizon = jnp.where(action == Action.LOOK_DOWN, 1, horizon)
-    horizon = jnp.where(action == Action.LOOK_UP, 0, horizon)
-    return (heading + right) & (ROTATIONS - 1), horizon
+    lowest = len(grid.horizons) - 1
+    higher: jax.Array | int = 0
+    lower: jax.Array | int = lowest
+    if lowest > 1:  # with two horizons, as in iTHOR, there is nothing to compute
+        higher, lower = jnp.maximum(horizon - 1, 0), jnp.minimum(horizon + 1, lowest)
+    horizon = jnp.where(action == Action.LOOK_DOWN, lower, horizon)
+    horizon = jnp.where(action == Action.LOOK_UP, higher, horizon)
+    return modulo(heading + right, grid.rotations), horizon
 
 
-def last_step(state: OdometryState) -> jax.Array:
+def tilt(grid: PoseGrid, horizon: jax.Array) -> jax.Array:
+    """How far the camera looks down, in units of 30 degrees."""
+    if grid.horizons == ITHOR.horizons:
+        return horizon
+    return jnp.asarray(np.array(grid.horizons) / 30, jnp.float32)[horizon]
+
+
+def last_step(grid: PoseGrid, state: OdometryState) -> jax.Array:
     """The cells [2] int32, along x and z, that the last action moved the agent by."""
     moved = (state.action == Action.MOVE_AHEAD) & ~state.blocked
-    return jnp.where(moved, jnp.asarray(STEPS)[state.heading], 0)
+    return jnp.where(moved, jnp.asarray(grid.steps)[state.heading], 0)

@@ -14,12 +14,14 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax
 
+from tdanet_jax.poses import ITHOR, PoseGrid
+
 
 class Start(NamedTuple):
     """How the agent faces at the start of an episode."""
 
-    rotation: jax.Array  # int32, 0 to 7: steps of 45 degrees clockwise from the grid's z axis
-    horizon: jax.Array  # int32, 1 while looking 30 degrees down, else 0
+    rotation: jax.Array  # int32, turns clockwise from the grid's z axis, see PoseGrid
+    horizon: jax.Array  # int32, index of the horizon; in iTHOR 1 looks 30 degrees down, 0 level
 
 
 class Motion(NamedTuple):
@@ -47,10 +49,13 @@ class Sensor:
     Attributes:
       REQUIRES: names of sensors that must come before it.
       width: length of `features`.
+      grid: the turns, horizons and steps of the agent, set after `make`; `width` must not depend on
+        it, so that a network can go to other rooms.
     """
 
     REQUIRES: ClassVar[tuple[str, ...]] = ()
     width: int
+    grid: PoseGrid = ITHOR
 
     def init(self, start: Start) -> Any:
         """The state at the start of an episode, before the first frame."""

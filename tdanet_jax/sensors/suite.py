@@ -6,6 +6,7 @@ and `blank` work on one episode.
 
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -36,7 +37,8 @@ def make(spec: ObservationSpec) -> dict[str, Sensor]:
             raise ValueError(f"--sensors {name}: `make` gives no Sensor")
         for missing in (required for required in sensor.REQUIRES if required not in out):
             raise ValueError(f"--sensors {name}: needs {missing} before it")
-        out[name] = sensor
+        out[name] = copy.copy(sensor)
+        out[name].grid = spec.grid
     return out
 
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from tdanet_jax.poses import GRID_SIZE
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.sensors import odometry
 from tdanet_jax.sensors.sensor import Frame, Motion, Sensor, Start
 from tdanet_jax.vocabulary import VISIBILITY_DISTANCE
@@ -68,8 +68,8 @@ class Triangulation(Sensor):
         self, state: TargetEstimate, motion: Motion, others: Mapping[str, Any]
     ) -> TargetEstimate:
         """Shifts the origin to where the agent stands now."""
-        cells = odometry.last_step(others["odometry"])
-        x, z = cells * GRID_SIZE
+        cells = odometry.last_step(self.grid, others["odometry"])
+        x, z = cells * self.grid.grid_size
         moved = jnp.stack([x, jnp.zeros_like(x), z])
         return state.replace(
             moment=state.moment - _dot(state.normal, moved),
@@ -87,7 +87,9 @@ class Triangulation(Sensor):
         """
         heading, horizon = others["odometry"].heading, others["odometry"].horizon
         boxes, is_target = frame.boxes, frame.mask & (frame.classes == frame.target)
-        rays = _rays(boxes, heading, horizon)  # as long as what they show is one metre deep
+        rays = _rays(
+            self.grid, boxes, heading, horizon
+        )  # as long as what they show is one metre deep
         lengths = jnp.linalg.norm(rays, axis=-1)
         directions = rays / lengths[:, None]
         cosine = _dot(directions, _direction(_solve(state)[0]))
@@ -120,7 +122,7 @@ class Triangulation(Sensor):
         and these two times the certainty.
         """
         position, weight = _solve(state)
-        angle = others["odometry"].heading * (jnp.pi / 4)
+        angle = others["odometry"].heading * (2 * jnp.pi / self.grid.rotations)
         sine, cosine = jnp.sin(angle), jnp.cos(angle)
         x, y, z = position
         turned = jnp.stack([x * cosine - z * sine, y, x * sine + z * cosine])
@@ -169,12 +171,12 @@ def _direction(position: jax.Array) -> jax.Array:
     return position / jnp.maximum(jnp.linalg.norm(position), 1e-6)
 
 
-def _rays(boxes: jax.Array, heading: jax.Array, horizon: jax.Array) -> jax.Array:
+def _rays(grid: PoseGrid, boxes: jax.Array, heading: jax.Array, horizon: jax.Array) -> jax.Array:
     """Rays to the centres of boxes [K, 3], one metre deep along the optical axis: [K, 3]."""
     right, up = 2 * boxes[:, 0] - 1, 1 - 2 * boxes[:, 1]
-    down = horizon * (jnp.pi / 6)
+    down = odometry.tilt(grid, horizon) * (jnp.pi / 6)
     ahead, up = jnp.cos(down) + up * jnp.sin(down), up * jnp.cos(down) - jnp.sin(down)
-    angle = heading * (jnp.pi / 4)
+    angle = heading * (2 * jnp.pi / grid.rotations)
     sine, cosine = jnp.sin(angle), jnp.cos(angle)
     return jnp.stack([right * cosine + ahead * sine, up, ahead * cosine - right * sine], axis=-1)
 

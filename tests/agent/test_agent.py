@@ -23,11 +23,15 @@ from tdanet_jax.env.reward import find_parents
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.classes import ClassVocabulary, make_vocabulary
 from tdanet_jax.models.factory import make_model
+from tdanet_jax.poses import PoseGrid
+from tdanet_jax.scenes import dataset, tabulation
+from tdanet_jax.scenes.dataset import Extras, Rooms
 from tdanet_jax.sensors.triangulation import no_estimate
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
 from tdanet_jax.vocabulary import TARGETS, Action
-from tests.support import samples, step_counter
+from tests.conftest import TINY, save_untrained
+from tests.support import samples, step_counter, toy
 
 CONFIG = TrainConfig(network=NetworkConfig(width=16, hidden=16, precision="float32"))
 
@@ -253,7 +257,7 @@ def test_an_agent_with_sensors_must_be_told_whether_its_move_was_blocked(odometr
 def test_odometry_knows_of_a_start_that_looks_down(odometry_agent):
     assert int(odometry_agent.start(horizon=30).sensors["odometry"].horizon) == 1
     assert int(odometry_agent.start(45.0001, 0.0).sensors["odometry"].heading) == 1
-    with pytest.raises(ValueError, match="horizon 15: neither 0 nor 30"):
+    with pytest.raises(ValueError, match="horizon 15: not among 0, 30 degrees"):
         odometry_agent.start(horizon=15)
 
 
@@ -262,6 +266,32 @@ def test_a_rotation_off_the_eight_is_refused(agent, odometry_agent, rotation):
     for one in (agent, odometry_agent):
         with pytest.raises(ValueError, match=f"rotation {rotation}: not a multiple of 45"):
             one.start(rotation)
+
+
+def test_a_network_of_ithors_rooms_goes_to_rooms_on_another_grid(some_rooms, glove, tmp_path):
+    """In turns of 30 degrees and three horizons; evaluated there, and as an agent on its own."""
+    grid = PoseGrid(0.25, 12, (-30, 0, 30))
+    network = dataclasses.replace(TINY.network, odometry=True, triangulation=True)
+    run, data = tmp_path / "run", tmp_path / "rooms.npz"
+    save_untrained(dataclasses.replace(TINY, network=network), run, some_rooms, glove)
+    corridor = dataclasses.replace(toy.corridor(), grid=grid)
+    scenes = [dataclasses.replace(corridor, name=name, room_type="hall") for name in "AB"]
+    rooms = Rooms(tabulation.build(scenes), Extras(parts={"A": "train", "B": "test"}))
+    dataset.save_rooms(rooms, data)
+    results = tdanet_jax.evaluate(run, data=str(data), policy="greedy", out=tmp_path / "out")
+    assert list(results["by_room"]) == ["hall"]
+    rows = (tmp_path / "out" / "episodes.jsonl").read_text().splitlines()
+    assert {json.loads(row)["rotation"] for row in rows} == set(range(0, 360, 30))
+    agent = tdanet_jax.load(run, grid=grid)
+    state = agent.start(150, -30)
+    assert int(state.sensors["odometry"].heading) == 2  # 60 degrees from an axis of the grid
+    assert int(state.sensors["odometry"].horizon) == 0
+    state, decision = agent.act(state, [Detection("apple", 0.4, 0.4, 0.6, 0.6)], "apple")
+    state, _ = agent.act(state, [], "apple", blocked=decision.action == Action.MOVE_AHEAD)
+    with pytest.raises(ValueError, match="rotation 45: not a multiple of 30 degrees"):
+        agent.start(45)
+    with pytest.raises(ValueError, match="horizon 15: not among -30, 0, 30 degrees"):
+        agent.start(0, 15)
 
 
 @pytest.fixture(scope="module")

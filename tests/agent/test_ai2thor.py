@@ -52,7 +52,8 @@ class StandIn:
             turn = self.settings["rotateStepDegrees"]
             self.rotation = (self.rotation + (turn if action == "RotateRight" else -turn)) % 360
         else:
-            horizon = self.horizon + {"LookDown": 30, "LookUp": -30}[action]
+            degrees = arguments.pop("degrees", 30)
+            horizon = self.horizon + {"LookDown": degrees, "LookUp": -degrees}[action]
             works = -30.1 < horizon < 60.1
             self.horizon = horizon if works else self.horizon
         assert not arguments
@@ -77,7 +78,7 @@ class StandIn:
     def _event(self, works):
         t = self.tables
         pose = poses.from_degrees(
-            self._at(self.x, self.z), round(self.rotation), round(self.horizon)
+            self._at(self.x, self.z), round(self.rotation), 30 * (self.horizon > 29)
         )
         rows = range(t.row_start[pose], t.row_start[pose + 1])
         reach = {t.row_object[row] for row in rows if t.row_visible[row]}
@@ -187,7 +188,8 @@ def compare(played, expected, rooms):
 class Script:
     """An agent that takes the given actions, and remembers what it was shown and told."""
 
-    def __init__(self, *actions: Action) -> None:
+    def __init__(self, *actions: Action, grid: poses.PoseGrid = poses.ITHOR) -> None:
+        self.grid = grid
         self.actions, self.seen, self.blocked, self.keys = list(actions), [], [], []
 
     def start(self, rotation, horizon):
@@ -340,7 +342,7 @@ def test_an_episode_ends_after_a_hundred_actions(rooms):
 
 @pytest.mark.parametrize(
     ("rotation", "horizon", "message"),
-    [(30, 0, "rotation 30: not a multiple of 45"), (0, 60, "horizon 60: neither 0 nor 30 degrees")],
+    [(30, 0, "rotation 30: not a multiple of 45"), (0, 60, "horizon 60: not among 0, 30 degrees")],
 )
 def test_a_start_off_the_poses_is_refused(agent, rooms, rotation, horizon, message):
     simulator = StandIn(rooms, where(rooms, 0, True))
@@ -364,6 +366,25 @@ def test_a_controller_with_other_settings_is_noticed(rooms, settings, action, le
         ai2thor.play(simulator, Script(action), "Mug")
     assert "is the controller made with SETTINGS?" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_agents_of_another_grid_play_on_it(rooms):
+    """Quarter turns and horizons that AI2-THOR's own steps of 30 degrees do not have."""
+    grid = poses.PoseGrid(0.25, 4, (0, 15, 60))
+    settings = ai2thor.settings(grid)
+    assert settings["rotateStepDegrees"] == 90
+    simulator = StandIn(rooms, where(rooms, 90, True), **settings)
+    actions = (RIGHT, LEFT, AHEAD, DOWN, DOWN, DOWN, UP, Action.DONE)
+    episode = ai2thor.play(simulator, Script(*actions, grid=grid), "Mug")
+    turns = [(round(place.rotation), round(place.horizon)) for place in episode.places]
+    down = [(90, 0), (90, 15), (90, 60), (90, 60), (90, 15), (90, 15)]
+    assert turns == [(90, 0), (180, 0), (90, 0), *down]
+    assert [ask for ask in simulator.asked if ask[0].startswith("Look")] == [
+        ("LookDown", {"degrees": 15}), ("LookDown", {"degrees": 45}), ("LookUp", {"degrees": 45})
+    ]  # fmt: skip
+    for rotations in (6, 12, 24):
+        with pytest.raises(ValueError, match=r"turns of .* degrees: AI2-THOR's MoveAhead leaves"):
+            ai2thor.play(simulator, Script(grid=poses.PoseGrid(rotations=rotations)), "Mug")
 
 
 def test_an_action_that_leads_elsewhere_is_noticed(rooms):

@@ -38,7 +38,7 @@ def test_drawn_starts_follow_the_seed_and_can_reach_the_target(ithor):
         (("FloorPlan228", "Toaster"), "Toaster: no target that can be seen in FloorPlan228"),
         (("FloorPlan228", "Sofa"), "RemoteControl"),
         (("FloorPlan228", "Laptop", Start(0, 0, 30)), "rotation 30: not a multiple of 45"),
-        (("FloorPlan228", "Laptop", Start(0, 0, 0, 20)), "horizon 20: neither 0 nor 30"),
+        (("FloorPlan228", "Laptop", Start(0, 0, 0, 20)), "horizon 20: not among 0, 30 degrees"),
     ],
 )  # fmt: skip
 def test_what_is_not_there_is_refused_with_what_is(ithor, arguments, message):

@@ -20,6 +20,7 @@ from tdanet_jax.env.params import make_params
 from tdanet_jax.env.reward import Parents, cosines, greatest_similarity, no_parents
 from tdanet_jax.env.types import EnvParams, EnvState, Observation
 from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.scenes.tabulation import build
 from tdanet_jax.vocabulary import TARGETS, Action
@@ -99,9 +100,9 @@ def assert_valid_start(world: World, state: EnvState, row: int) -> None:
     tables = world.tables
     pose = int(state.pose[row])
     target = tables.targets[int(state.target[row])]
-    scene = int(tables.position_scene[pose // 16])
+    scene = int(tables.position_scene[world.pose_of(pose).position])
     assert target in in_use(tables)[ROOMS[tables.room_type[scene]]]
-    assert pose_of(pose).horizon == 0
+    assert world.pose_of(pose).horizon == 0
     assert int(state.steps[row]) == 0
     assert int(state.parents_seen[row]) == 0
     assert int(state.shortest[row]) == world.distance(pose, target) + 1
@@ -122,7 +123,7 @@ def assert_worlds_agree(world: World, params: EnvParams, batch: int, steps: int,
     keys = jax.random.split(jax.random.key(seed), steps + 1)
     obs, state = reset(jax.random.split(keys[0], batch), params)
     episodes = [
-        Episode(pose_of(int(state.pose[b])), tables.targets[int(state.target[b])])
+        Episode(world.pose_of(int(state.pose[b])), tables.targets[int(state.target[b])])
         for b in range(batch)
     ]
     for b in range(batch):
@@ -130,14 +131,17 @@ def assert_worlds_agree(world: World, params: EnvParams, batch: int, steps: int,
     successes = 0
     for t in range(steps):
         for b, episode in enumerate(episodes):
-            expected = world.detections(state_of(episode.pose), merge=False)
+            expected = world.detections(world.state_of(episode.pose), merge=False)
             assert_same_detections(detections_of(obs, b, tables), expected)
             assert tables.classes[int(obs.target[b])] == episode.target
         actions = rng.choice(6, batch, p=[0.3, 0.15, 0.15, 0.15, 0.15, 0.1])
         for b, episode in enumerate(episodes):
-            if rng.random() < 0.5 and world.distance(state_of(episode.pose), episode.target):
+            if rng.random() < 0.5 and world.distance(world.state_of(episode.pose), episode.target):
                 actions[b] = world.best_action(episode.pose, episode.target)
-            elif rng.random() < 0.5 and world.distance(state_of(episode.pose), episode.target) == 0:
+            elif (
+                rng.random() < 0.5
+                and world.distance(world.state_of(episode.pose), episode.target) == 0
+            ):
                 actions[b] = DONE
         began = [int(v) for v in state.shortest]
         out = step(jax.random.split(keys[t + 1], batch), state, jnp.asarray(actions), params)
@@ -152,13 +156,13 @@ def assert_worlds_agree(world: World, params: EnvParams, batch: int, steps: int,
             assert int(info["shortest"][b]) == began[b]
             successes += expected.success
             final = info["final_state"]
-            assert int(final.pose[b]) == state_of(episode.pose)
+            assert int(final.pose[b]) == world.state_of(episode.pose)
             assert int(final.steps[b]) == episode.steps
             assert parents_seen(params, nth(final, b), tables) == episode.parents_seen
             if expected.terminated or expected.truncated:
                 assert_valid_start(world, state, b)
                 target = tables.targets[int(state.target[b])]
-                episodes[b] = Episode(pose_of(int(state.pose[b])), target)
+                episodes[b] = Episode(world.pose_of(int(state.pose[b])), target)
             else:
                 chex.assert_trees_all_equal(nth(state, b), nth(final, b))
                 away = world.distance(int(state.pose[b]), episode.target)
@@ -516,6 +520,27 @@ def test_resets_are_uniform_over_room_types_then_scenes_then_targets_then_starts
         assert_uniform(rotation[scene == s], set(range(8)))
         for p in np.unique(position[scene == s]):
             assert_uniform(rotation[position == p], set(range(8)))
+
+
+@pytest.mark.parametrize("rotations", [4, 6, 8, 12, 24])
+def test_rotations_of_other_grids_are_uniform_and_independent_of_the_target(rotations: int) -> None:
+    grid = PoseGrid(rotations=rotations, horizons=(-30, 0))
+    here = {0: [Sighting(0), Sighting(1)]}
+    ahead = [[0] * rotations, [1] * rotations]
+    ahead[1][0] = 0
+    objects = [("Mug", (0.0, 0.0, 0.0)), ("Bread", (0.0, 0.0, 0.0))]
+    rooms = [Room("kitchen", ahead, objects, here)] * 3
+    tables = tables_of(rooms, ["Bread", "Mug"], ["Mug", "Bread"], grid=grid)
+    keys = jax.random.split(jax.random.key(8), 20_000)
+    drawn = jax.jit(jax.vmap(dynamics.reset_state, (0, None)))(keys, params_of(tables))
+    state = jax.device_get(drawn)
+    position, rotation, horizon = grid.split(state.pose)
+    assert (horizon == grid.level).all()
+    for goal in range(2):
+        for place in range(6):
+            assert_uniform(
+                rotation[(state.target == goal) & (position == place)], set(range(rotations))
+            )
 
 
 def test_the_real_rooms_offer_every_valid_episode_and_no_other(some_rooms: SceneTables) -> None:

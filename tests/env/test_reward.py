@@ -107,6 +107,17 @@ def test_a_parent_that_few_rooms_of_the_target_hold_is_left_out() -> None:
     assert names == {"Sink": pytest.approx(0.5)}
 
 
+def test_a_target_of_two_room_types_has_its_parents_from_both() -> None:
+    rooms = [furnished("kitchen", Mug=0.0, Sink=1.0), furnished("bedroom", Mug=0.0, Sink=2.0)]
+    tables = tables_of(rooms, CLASSES, ["Mug"])
+    for targets, worth in (
+        ({"kitchen": ["Mug"]}, {"Sink": 0.5}),
+        ({"bedroom": ["Mug"]}, {}),
+        ({"kitchen": ["Mug"], "bedroom": ["Mug"]}, {"Sink": 0.25}),
+    ):
+        assert dict(parents_by_name(tables, find_parents(tables, targets), "Mug")) == worth
+
+
 def test_a_target_that_is_not_asked_for_has_no_parents() -> None:
     tables = tables_of([furnished("kitchen", Mug=0.0, Apple=0.5, Sink=1.0)], CLASSES, ["Apple"])
     found = find_parents(tables, {"kitchen": []})

@@ -114,7 +114,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint binary --episode 3", "binary/config.json: 'utf-8' codec can't decode"),
         ("--checkpoint bare --start nan 0 0", "--start nan 0.0 0: must be finite"),
         ("--checkpoint bare --start 0 inf 0", "--start 0.0 inf 0: must be finite"),
-        ("--checkpoint bare --start 0 0 30", "--start 0.0 0.0 30: rotation 30: not a multiple of"),
+        ("--checkpoint bare --start 0 0 20", "--start 0.0 0.0 20: rotation 20: not a multiple of"),
         ("--checkpoint bare --episode 3 --seed=-1", "--seed -1: must be between 0 and 4294967295"),
         ("--checkpoint bare --episode 3 --out a.doc", "--out a.doc: end it in one of ."),
     ],
@@ -156,7 +156,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ),
         ("inspect FloorPlan1 --rotation 90", "--rotation and --horizon need --position"),
         ("inspect FloorPlan1 --position 0 0 --rotation 50", "rotation 50: not a multiple of 45"),
-        ("inspect FloorPlan1 --position 0 0 --horizon 5", "horizon 5: neither 0 nor 30"),
+        ("inspect FloorPlan1 --position 0 0 --horizon 5", "horizon 5: not among 0, 30 degrees"),
         ("inspect FloorPlan1 --position nan 0", "--position nan 0.0: must be finite"),
         ("inspect FloorPlan1 --out a.doc", "--out a.doc: end it in one of ."),
         ("inspect FloorPlan1 --out no/a.png", "no/a.png: No such file or directory"),
@@ -170,8 +170,13 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("collect FloorPlan1=kitchen --out full/file", "--out full/file: exists"),
         ("collect FloorPlan1=kitchen --out no/a.json", "--out no/a.json: no such folder"),
         ("collect", "collect: name a room, say FloorPlan1=kitchen"),
-        ("collect FloorPlan1", "FloorPlan1: not NAME=TYPE with a type of kitchen"),
-        ("collect FloorPlan1=hall", "FloorPlan1=hall: not NAME=TYPE"),
+        ("collect FloorPlan1", "FloorPlan1: not NAME=TYPE, with a type such as kitchen"),
+        ("collect FloorPlan1=a/b", "room_type 'a/b': must have no path separator"),
+        ("collect FloorPlan1=hall --grid-size 1", "gridSize 1.0: must be from 0.05 to 0.5 metres"),
+        (
+            "import --from empty --part test",
+            "--room-type, --part and --rooms: only with a scene file",
+        ),
     ],
 }
 

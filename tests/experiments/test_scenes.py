@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 from experiments import scenes
-from tdanet_jax.scenes import SceneTables
+from tdanet_jax.poses import PoseGrid
+from tdanet_jax.scenes import SceneTables, dataset
 from tests.experiments.test_data import fails
 from tests.scenes.test_metadata import DOCUMENT
 from tests.support.command import TINY
@@ -58,6 +59,114 @@ def test_own_rooms_as_the_page_shows_them(
         assert results["unseen"] is None
         rows = Path("runs", folder, "episodes.jsonl").read_text().splitlines()
         assert {json.loads(row)["scene"] for row in rows} == {"Office"}
+
+
+@pytest.mark.parametrize(
+    "trained", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["evaluated", "trained"]
+)
+def test_offices_on_another_grid_as_the_page_shows_them(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    trained: bool,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("offices.json").write_text(block("scenes.md", "offices.json"))
+    *lines, train = block("scenes.md", "offices commands").splitlines()
+    if trained:
+        lines.append(shlex.join([*shlex.split(train), "--steps", "80", "--odometry", *TINY]))
+    for line in lines:
+        _, _, module, *given = shlex.split(line)
+        importlib.import_module(module).main(given)
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert "Targets in rooms of type office: Laptop\n" in said.out
+    written = sorted(Path("runs").iterdir())
+    assert len(written) == 1 + trained
+    for folder in written:
+        results = json.loads((folder / "results.json").read_text())
+        assert list(results["by_room"]) == ["office"]
+        assert list(results["by_target"]) == ["Laptop"]
+        rows = [json.loads(row) for row in (folder / "episodes.jsonl").read_text().splitlines()]
+        assert {row["rotation"] for row in rows} == {0, 90, 180, 270}
+        assert {row["horizon"] for row in rows} == {0}
+        assert {row["scene"] for row in rows} == {"Office-2"}
+        assert max(row["e"] for row in rows) <= 200
+    export = ["export", "--data", "offices.npz", "--out", "original"]
+    assert "rooms of type office: the original layout has" in fails(scenes, export, capsys)
+    assert not Path("original").exists()
+    rooms = dataset.load_rooms("offices.npz")
+    assert rooms.tables.grid == PoseGrid(0.5, 4, (0,))
+    assert len(rooms.tables.position) * 4 == rooms.tables.num_states
+
+
+LABELS = "name,room_type,part\nFloorPlan1-1,kitchen,train\nFloorPlan_Train1_1,hall,\n"
+
+
+def test_types_and_parts_from_flags_and_a_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file says most, then the table, iTHOR's names, the flags."""
+    monkeypatch.chdir(tmp_path)
+    bare = {key: value for key, value in DOCUMENT.items() if key != "room_type"}
+    names = ("FloorPlan1-1", "FloorPlan_Train1_1", "FloorPlan430-5", "FloorPlan401")
+    documents = [{**bare, "name": name} for name in names]
+    documents.append({**DOCUMENT, "name": "Lab", "split": "test"})
+    Path("rooms.json").write_text(json.dumps(documents))
+    Path("rooms.csv").write_text(LABELS)
+    flags = "--rooms rooms.csv --room-type den --part test --out rooms.npz"
+    scenes.main(["import", "rooms.json", *flags.split()])
+    rooms = dataset.load_rooms("rooms.npz")
+    tables = rooms.tables
+    assert tables.room_types[4:] == ("den", "hall")
+    assert [tables.room_types[kind] for kind in tables.room_type] == [
+        "kitchen", "hall", "den", "bathroom", "bedroom"
+    ]  # fmt: skip
+    assert rooms.extras is not None
+    assert rooms.extras.parts == {
+        "FloorPlan1-1": "train", "FloorPlan_Train1_1": "test", "FloorPlan430-5": "test",
+        "Lab": "test",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("table", "flags", "message"),
+    [
+        (None, "", "rooms.json: Lab: no room type; give it in the file"),
+        (None, "--rooms none.csv", "none.csv: No such file or directory"),
+        (None, "--room-type a/b", "room_type 'a/b': must have no path separator"),
+        (None, "--room-type Kitchen", "room_type 'Kitchen': did you mean kitchen?"),
+        ("", "", "rooms.csv: its first line must be name,room_type,part"),
+        ("name,room_type\n", "", "rooms.csv: its first line must be name,room_type,part"),
+        ("name,room_type,part\nDen,office,\n", "", "no room is called Den, which --rooms lists"),
+        ("name,room_type,part\nLab,office\n", "", "rooms.csv, line 2: 2 cells, not 3"),
+        (
+            "name,room_type,part\nLab,office,half\n",
+            "",
+            "rooms.csv, line 2: split 'half', not train",
+        ),
+        ("name,room_type,part\n,office,test\n", "", "rooms.csv, line 2: no name"),
+        ("name,room_type,part\n" + 2 * "Lab,den,\n", "", "rooms.csv, line 3: Lab is there twice"),
+        ("name,room_type,part\nLab,,test\n", "", "rooms.json: Lab: no room type"),
+    ],
+)
+def test_labels_that_do_not_do(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    table: str | None,
+    flags: str,
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    bare = {key: value for key, value in DOCUMENT.items() if key != "room_type"}
+    Path("rooms.json").write_text(json.dumps(bare))
+    if table is not None:
+        Path("rooms.csv").write_text(table)
+        flags += " --rooms rooms.csv"
+    said = fails(scenes, ["import", "rooms.json", "--out", "rooms.npz", *flags.split()], capsys)
+    assert message in said
+    assert not Path("rooms.npz").exists()
 
 
 def test_unused_rooms_and_missing_word_vectors_are_reported(
@@ -167,7 +276,7 @@ def test_bad_input(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "Lab: no objects" in fails(
         scenes, ["import", str(here / "bad.json"), "--out", str(out)], capsys
     )
-    assert "FloorPlan1=hall" in fails(scenes, ["collect", "FloorPlan1=hall"], capsys)
+    assert "FloorPlan1=" in fails(scenes, ["collect", "FloorPlan1="], capsys)
     assert sorted(p.name for p in here.iterdir()) == ["bad.json", "lab.json"]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneError, collect, metadata
 from tests.scenes.test_metadata import DOCUMENT
 
@@ -50,11 +51,20 @@ def test_what_is_collected_can_be_read(tmp_path: Path) -> None:
     path.write_text("an older file")
     collect.write_scenes(documents, path)
     first, second = metadata.read_scenes(path)
-    assert (first.name, first.room_type) == ("FloorPlan1", 0)
-    assert (second.name, second.room_type) == ("Mine", 3)
+    assert (first.name, first.room_type) == ("FloorPlan1", "kitchen")
+    assert (second.name, second.room_type) == ("Mine", "bathroom")
     assert len(first.objects) == 2
     assert first.default_rotation == 270
     assert [p.name for p in tmp_path.iterdir()] == ["scenes.json"]
+
+
+def test_another_grid_size_is_asked_for_and_noted(tmp_path: Path) -> None:
+    controller = FakeController()
+    documents = collect.collect(controller, [("Mine", "den")], grid_size=0.125)
+    assert controller.asked[0] == ("Mine", 0.125)
+    collect.write_scenes(documents, tmp_path / "scenes.json")
+    [scene] = metadata.read_scenes(tmp_path / "scenes.json")
+    assert scene.grid == PoseGrid(0.125)
 
 
 def test_a_failed_action() -> None:

@@ -12,9 +12,11 @@ import pytest
 
 from tdanet_jax.io import archive
 from tdanet_jax.io.untrusted import FileError
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneTables, dataset, tabulation
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode, Rooms
 from tdanet_jax.splits import make_split
+from tdanet_jax.vocabulary import ROOM_TYPES
 from tests.support import toy
 
 
@@ -105,7 +107,8 @@ def test_rooms_with_a_part_of_their_own() -> None:
     kinds = {"FloorPlan1": 0, "FloorPlan2": 0, "FloorPlan30": 0, "Attic": 2, "Den": 0, "Hall": 0}
     kinds |= {f"Own{i}": 1 for i in range(5)}
     scenes = [
-        dataclasses.replace(corridor, name=name, room_type=kind) for name, kind in kinds.items()
+        dataclasses.replace(corridor, name=name, room_type=ROOM_TYPES[kind])
+        for name, kind in kinds.items()
     ]
     parts = {"FloorPlan2": "test", "Den": "train", "Hall": "test"}
     parts |= {f"Own{i}": "train" for i in range(5)}
@@ -120,6 +123,77 @@ def test_rooms_with_a_part_of_their_own() -> None:
     assert found[True] == ({"FloorPlan1"} | own - {"Own4"}, {"Den", "Own4"})
     split = make_split("18/4")
     assert dataset.assign_rooms(split, Rooms(rooms.tables, None)) == split
+
+
+def test_a_grid_of_its_own_is_kept(rooms: SceneTables, tmp_path: Path) -> None:
+    """And tables without one are as before there were such grids, hash included."""
+    assert b"grid" not in rooms.to_arrays()["rest"].tobytes()
+    grid = PoseGrid(0.5, 4, (-30, 0))
+    scene = dataclasses.replace(toy.corridor(), points=toy.line(5) * (1, 1, 2), grid=grid)
+    tables = tabulation.build([scene])
+    assert tables.num_states == 5 * 8
+    path = tmp_path / "rooms.npz"
+    dataset.save_rooms(Rooms(tables, None), path)
+    found = dataset.load_rooms(path).tables
+    assert found.grid == grid
+    assert found.data_version == tables.with_known_targets().data_version
+    assert found.as_scene().grid == grid
+    assert dataclasses.replace(tables, grid=PoseGrid(0.4, 4, (-30, 0))).data_version != (
+        tables.data_version
+    )
+    for broken in (PoseGrid(0.5, 8, (0,)), PoseGrid(0.5, 4, (-30, 0, 30))):
+        dataset.save_rooms(Rooms(dataclasses.replace(tables, grid=broken), None), path)
+        with pytest.raises(FileError, match="not a file of rooms"):
+            dataset.load_rooms(path)
+    arrays = tables.to_arrays()
+    rest = json.loads(arrays["rest"].tobytes())
+    rest["grid"]["rotations"] = 7
+    arrays["rest"] = np.frombuffer(json.dumps(rest).encode(), np.uint8)
+    archive.write(path, arrays)
+    with pytest.raises(FileError, match=r"not a file of rooms \(7 rotations"):
+        dataset.load_rooms(path)
+
+
+def test_room_types_of_ones_own(tmp_path: Path) -> None:
+    """Their targets are what their rooms hold, seen or unseen as elsewhere; iTHOR's stay."""
+    shown = toy.thing("Laptop", (0.0, toy.CAMERA, 2.0)), toy.thing("Mug", (0.2, toy.CAMERA, 2.0))
+    kinds = {"B1": "study", "A1": "office", "A2": "office", "K": "kitchen"}
+    scenes = [
+        dataclasses.replace(toy.room(toy.line(3), *shown[:count], name=name), room_type=kind)
+        for (name, kind), count in zip(kinds.items(), (1, 1, 2, 2), strict=True)
+    ]
+    tables = tabulation.build(scenes)
+    assert tables.room_types == (*ROOM_TYPES, "office", "study")
+    assert tables.room_type.tolist() == [5, 4, 4, 0]
+    path = tmp_path / "rooms.npz"
+    parts = {"A1": "train", "A2": "test"}
+    dataset.save_rooms(Rooms(tables, Extras(parts=parts)), path)
+    rooms = dataset.load_rooms(path)
+    assert rooms.tables.room_types == tables.room_types
+    assert rooms.tables.subset(["A2"]).as_scene().room_type == "office"
+    assert rooms.tables.data_version == tables.with_known_targets().data_version
+    found = {
+        text: dataset.assign_rooms(make_split(text, validation), rooms, validation)
+        for text, validation in (("22/0", False), ("18/4", False), ("Vase", True))
+    }
+    assert found["22/0"].seen["office"] == ("Mug", "Laptop")
+    assert found["22/0"].seen["study"] == ("Laptop",)
+    assert found["18/4"].seen["office"] == ("Mug",)
+    assert found["18/4"].unseen["office"] == ("Laptop",)
+    assert found["18/4"].seen["kitchen"] == make_split("18/4").seen["kitchen"]
+    assert "A1" in found["18/4"].train_scenes
+    assert "A2" in found["18/4"].eval_scenes
+    assert found["Vase"].seen["office"] == ("Mug", "Laptop")
+    for broken in (("office", *ROOM_TYPES[1:], "a", "b"), (*ROOM_TYPES, "x", "x"), ROOM_TYPES,
+                   (*ROOM_TYPES, "../up", "b")):  # fmt: skip
+        dataset.save_rooms(Rooms(dataclasses.replace(tables, room_types=broken), None), path)
+        with pytest.raises(FileError, match="not a file of rooms"):
+            dataset.load_rooms(path)
+    dataset.save_rooms(
+        Rooms(dataclasses.replace(tables, scenes=("../B", "A", "C", "K")), None), path
+    )
+    with pytest.raises(FileError, match="must have no path separator"):
+        dataset.load_rooms(path)
 
 
 def test_other_archives(rooms: SceneTables, tmp_path: Path) -> None:

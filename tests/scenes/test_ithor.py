@@ -83,7 +83,7 @@ def test_written_and_read_back(wheels: tuple[Path, Path], tmp_path: Path) -> Non
     for i in (0, 31, 119):
         room, number = ROOM_TYPES[i // 30], i % 30
         scene = scenes[i]
-        assert scene.room_type == i // 30
+        assert scene.room_type == room
         assert scene.name == f"FloorPlan{SCENE_NUMBERS[room][number]}"
         agent = [0.25 * (SCENE_NUMBERS[room][number] % 4), 0.9, -0.5]
         assert np.allclose(scene.default_position, agent, atol=1e-4)

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tdanet_jax.scenes.labels import Labels
 
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneError, metadata
 
 BOX = {"center": {"x": 0.0, "y": 1.5, "z": 1.0}, "size": {"x": 0.2, "y": 0.2, "z": 0.2}}
@@ -52,7 +54,7 @@ def read(tmp_path: Path, document: Any) -> Any:
 
 def test_a_scene_file(tmp_path: Path) -> None:
     [scene] = read(tmp_path, DOCUMENT)
-    assert (scene.name, scene.room_type) == ("Lab", 2)
+    assert (scene.name, scene.room_type) == ("Lab", "bedroom")
     assert scene.points[:, 2].tolist() == [0.0, 0.25, 0.5]
     assert [item.object_id for item in scene.objects] == ["Desk|0", "Mug|1"]
     desk, mug = scene.objects
@@ -76,6 +78,22 @@ def test_a_list_of_scenes(tmp_path: Path) -> None:
 def test_a_room_may_say_what_it_is_for(tmp_path: Path) -> None:
     assert [scene.part for scene in read(tmp_path, DOCUMENT)] == [None]
     assert [scene.part for scene in read(tmp_path, {**DOCUMENT, "split": "test"})] == ["test"]
+
+
+def test_a_room_may_have_a_grid_of_its_own(tmp_path: Path) -> None:
+    """Under which turns of 20 degrees are a default frame where they are possible."""
+    assert read(tmp_path, DOCUMENT)[0].grid == PoseGrid()
+    fields = {"gridSize": 0.125, "rotateStepDegrees": 30.0, "horizons": [-30, 0, 30]}
+    document = {**DOCUMENT, **fields}
+    document["agent"] = {**DOCUMENT["agent"], "rotation": {"x": 0, "y": 150.5, "z": 0}}
+    [scene] = read(tmp_path, document)
+    assert scene.grid == PoseGrid(0.125, 12, (-30, 0, 30))
+    assert scene.default_rotation == 150
+    assert len(scene.points) == 3
+    other = {**DOCUMENT, **fields, "name": "Den"}
+    with pytest.raises(SceneError, match=r"scenes.json: Den: another gridSize, .* than Lab;"):
+        read(tmp_path, [DOCUMENT, other])
+    assert len(read(tmp_path, [document, other])) == 2
 
 
 @pytest.mark.parametrize(("horizon", "turn"), [(30.0, 0.0), (0.0, 20.0)])
@@ -115,10 +133,26 @@ CASES = [
     (["objects", 0, "objectOrientedBoundingBox"], {}, None),
     (["objects", 0, "objectOrientedBoundingBox"], {"cornerPoints": [[0, 0, 0]]}, "8 finite"),
     (["objects", 0, "parentReceptacles"], 3, r"Lab: Mug\|1: parentReceptacles"),
-    (["room_type"], "hall", "Lab: room_type 'hall'"),
+    (["room_type"], None, "Lab: no room type; give it in the file .*--room-type or --rooms"),
+    (["room_type"], 3, "Lab: room_type 3: not a name"),
+    (["room_type"], "", "Lab: room_type '': must have from 1 to 200 characters"),
+    (["room_type"], "Living Room", "Lab: room_type 'Living Room': did you mean living_room?"),
+    (["name"], " ", "name ' ': must have from 1 to 200 characters"),
+    (["name"], "x" * 201, "must have from 1 to 200 characters"),
+    (["name"], "../Lab", "name '../Lab': must have no path separator"),
+    (["name"], "a\\b", "must have no path separator"),
+    (["name"], "..", "must have no path separator"),
+    (["name"], "a\nb", "must have no path separator or control character"),
     (["name"], None, "a scene without a name"),
     (["split"], "half", "Lab: split 'half', not train or test"),
     (["split"], ["test"], "Lab: split "),
+    (["gridSize"], 0.4, "Lab: reachable position x .*: off the 0.4 m grid"),
+    (["gridSize"], "wide", "Lab: gridSize wide: must be from 0.05 to 0.5 metres"),
+    (["rotateStepDegrees"], 40, r"Lab: rotateStepDegrees 40, not one of \[15, 30, 45, 60, 90\]"),
+    (["rotateStepDegrees"], "90", "Lab: rotateStepDegrees '90', not one of"),
+    (["horizons"], 30, "Lab: horizons is not a list"),
+    (["horizons"], [], r"Lab: horizons \[\]: must be whole degrees"),
+    (["horizons"], [0, [30]], "Lab: horizons .*: must be whole degrees"),
     (["agent"], 3, "Lab: agent"),
     (["agent", "position"], None, "Lab: agent"),
     (["agent", "cameraHorizon"], "level", "Lab: agent"),
@@ -169,6 +203,9 @@ places = st.sampled_from(
         ["name"],
         ["room_type"],
         ["split"],
+        ["gridSize"],
+        ["rotateStepDegrees"],
+        ["horizons"],
     ]
 )
 
@@ -177,7 +214,7 @@ places = st.sampled_from(
 def test_whatever_is_wrong_is_a_scene_error(path: list[Any], value: Any) -> None:
     message = ""
     try:
-        metadata._read_scene(Path("scenes.json"), broken(path, value))
+        metadata._read_scene(Path("scenes.json"), broken(path, value), Labels())
     except SceneError as error:
         message = str(error)
     assert "\n" not in message

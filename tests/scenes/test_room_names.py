@@ -35,9 +35,11 @@ def test_names_that_are_unsafe_as_files_are_refused(name: str, reason: str) -> N
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [("FloorPlan1", RoomKind(0, None)), ("FloorPlan430", RoomKind(3, None)),
-     ("FloorPlan20-5", RoomKind(0, "train")), ("FloorPlan21-1", RoomKind(0, "test")),
-     ("FloorPlan220_b", RoomKind(1, "train")), ("FloorPlan330 night", RoomKind(2, "test"))],
+    [("FloorPlan1", RoomKind("kitchen", None)), ("FloorPlan430", RoomKind("bathroom", None)),
+     ("FloorPlan20-5", RoomKind("kitchen", "train")),
+     ("FloorPlan21-1", RoomKind("kitchen", "test")),
+     ("FloorPlan220_b", RoomKind("living_room", "train")),
+     ("FloorPlan330 night", RoomKind("bedroom", "test"))],
 )  # fmt: skip
 def test_names_that_begin_with_an_ithor_room_have_its_kind(name: str, kind: RoomKind) -> None:
     assert room_names.kind_of(name) == kind
@@ -52,13 +54,17 @@ def test_other_names_have_no_kind(name: str) -> None:
 
 
 def test_a_table_says_more_than_a_name_and_a_name_more_than_the_rest() -> None:
-    table = {"FloorPlan1-1": RoomKind(2, "test"), "Lab": RoomKind(1, None)}
-    kinds = Kinds(table, RoomKind(3, "train"))
-    assert kinds.of("FloorPlan1-1") == RoomKind(2, "test")
-    assert kinds.of("FloorPlan1-2") == RoomKind(0, "train")
-    assert kinds.of("Lab") == RoomKind(1, None)
-    assert kinds.of("Attic") == RoomKind(3, "train")
-    assert Kinds().of("Attic") is None
+    table = {"FloorPlan1-1": RoomKind("bedroom", "test"), "Lab": RoomKind("living_room", None)}
+    kinds = Kinds(table, RoomKind("bathroom", "train"))
+    assert kinds.of("FloorPlan1-1") == RoomKind("bedroom", "test")
+    assert kinds.of("FloorPlan1-2") == RoomKind("kitchen", "train")
+    assert kinds.of("Lab") == RoomKind("living_room", "train")
+    assert kinds.of("Attic") == RoomKind("bathroom", "train")
+    assert Kinds().of("Attic") == RoomKind(None, None)
+    # What the room's own file says counts before all, and the rest is filled in.
+    assert kinds.of("FloorPlan1-1", RoomKind("office")) == RoomKind("office", "test")
+    assert kinds.of("Lab", RoomKind(None, "test")) == RoomKind("living_room", "test")
+    assert kinds.of("FloorPlan1").part is None  # iTHOR's own: the split decides
 
 
 def test_names_are_sorted_by_their_numbers() -> None:
@@ -71,20 +77,20 @@ def test_names_are_sorted_by_their_numbers() -> None:
 def test_a_table_of_rooms(tmp_path: Path) -> None:
     path = tmp_path / "rooms.csv"
     path.write_text('name,room_type,part\n"Lab, east",kitchen,train\n\n Office ,bedroom,\n')
-    expected = {"Lab, east": RoomKind(0, "train"), "Office": RoomKind(2, None)}
+    expected = {"Lab, east": RoomKind("kitchen", "train"), "Office": RoomKind("bedroom", None)}
     assert room_names.read_table(path) == expected
     path.write_bytes(b"\xef\xbb\xbfroom_type,name\r\nbathroom,Spa\r\n")  # as a spreadsheet writes
-    assert room_names.read_table(path) == {"Spa": RoomKind(3, None)}
+    assert room_names.read_table(path) == {"Spa": RoomKind("bathroom", None)}
 
 
 @pytest.mark.parametrize(
     ("text", "reason"),
     [("", "line 1: the columns are not name, room_type, part"),
-     ("name,part\nLab,train\n", "line 1: the columns"),
+     ("room_type,part\nkitchen,train\n", "line 1: the columns"),
      ("name,room_type,name\nLab,kitchen,Lab\n", "line 1: the columns"),
      ("name,room_type,floor\nLab,kitchen,2\n", "line 1: the columns"),
      ("name,room_type\nLab,kitchen,train\n", "line 2: 3 columns, not 2"),
-     ("name,room_type\nLab,hall\n", "line 2: room_type 'hall', not kitchen"),
+     ("name,room_type\nLab,Kitchen\n", "line 2: room_type 'Kitchen': did you mean kitchen"),
      ("name,room_type,part\nLab,kitchen,val\n", "line 2: part 'val', not train or test"),
      ("name,room_type\n../up,kitchen\n", r"line 2: room name '\.\./up': is a path"),
      ("name,room_type\nLab,kitchen\nLab,bedroom\n", "line 3: Lab is listed twice"),

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneError, SceneTables, tabulation
 from tdanet_jax.scenes.visibility import geometry
 from tdanet_jax.vocabulary import ALL_TARGETS
@@ -38,7 +39,7 @@ def test_states_of_poses() -> None:
     assert t.nearest_state(0, 9.0, 9.0, -45) == (4 * 8 + 7) * 2
     assert t.nearest_state(1, 9.0, 0.0, 360) == 5 * 16
     for rotation, horizon in ((20, 0), (0, 45)):
-        with pytest.raises(SceneError):
+        with pytest.raises(ValueError, match=r"not a multiple of 45|not among 0, 30"):
             t.nearest_state(0, 0, 0, rotation, horizon)
 
 
@@ -142,6 +143,8 @@ def test_the_version_follows_every_field(rooms: SceneTables, field: str) -> None
         changed.flat[-1] = ~changed.flat[-1] if value.dtype == bool else changed.flat[-1] + 1
     elif isinstance(value, tuple):
         changed = (*value[:-1], value[-1] + "x")
+    elif isinstance(value, PoseGrid):
+        changed = PoseGrid(rotations=12)
     else:
         changed = value + 1
     other = dataclasses.replace(rooms, **{field: changed})

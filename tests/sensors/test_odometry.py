@@ -20,6 +20,7 @@ from tdanet_jax.env.params import make_params
 from tdanet_jax.env.reward import no_parents
 from tdanet_jax.env.types import EnvParams, EnvState, Observation
 from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.scenes.tabulation import build
 from tdanet_jax.sensors import suite
@@ -53,41 +54,53 @@ LONGEST = 120
 SENSOR = Odometry()
 
 
+def nearest(heading: int) -> int:
+    """The multiple of 45 degrees that is nearest to a heading."""
+    return min(range(0, 361, 45), key=lambda direction: abs(direction - heading)) % 360
+
+
 class SlowOdometry:
     """The agent's pose and map in one episode, in degrees, tuples and sets."""
 
-    def __init__(self, diagonal: bool, horizon: int) -> None:
+    def __init__(
+        self, diagonal: bool, horizon: int, grid: PoseGrid = ITHOR, heading: int | None = None
+    ) -> None:
+        self.grid = grid
         self.x = self.z = 0
-        self.heading = 45 * diagonal
+        self.heading = 45 * diagonal if heading is None else heading
         self.horizon = horizon
         self.action = NOTHING
         self.was_blocked = False
-        self.stood = {(0, 0, self.heading)}
+        self.stood = {(0, 0, nearest(self.heading))}
         self.in_the_way: set[tuple[int, int]] = set()
 
     def update(self, action: int, did_not_move: bool) -> None:
         """An action, and whether it failed to move the agent."""
-        east, north = STEPS[self.heading]
+        east, north = STEPS[nearest(self.heading)]
         self.action, self.was_blocked = action, action == MOVE_AHEAD and did_not_move
         if self.was_blocked:
             self.in_the_way.add(((self.x + east) % 64, (self.z + north) % 64))
         elif action == MOVE_AHEAD:
             self.x, self.z = self.x + east, self.z + north
         elif action == ROTATE_LEFT:
-            self.heading = (self.heading - 45) % 360
+            self.heading = (self.heading - self.grid.turn) % 360
         elif action == ROTATE_RIGHT:
-            self.heading = (self.heading + 45) % 360
-        elif action in (LOOK_UP, LOOK_DOWN):
-            self.horizon = int(action == LOOK_DOWN)
-        self.stood.add((self.x % 64, self.z % 64, self.heading))
+            self.heading = (self.heading + self.grid.turn) % 360
+        elif action == LOOK_UP and self.horizon > 0:
+            self.horizon -= 1
+        elif action == LOOK_DOWN and self.horizon < len(self.grid.horizons) - 1:
+            self.horizon += 1
+        self.stood.add((self.x % 64, self.z % 64, nearest(self.heading)))
 
     def motion(self) -> list[float]:
         """The twelve numbers, from scalar products with the directions right and ahead."""
         sine, cosine = (f(math.radians(self.heading)) for f in (math.sin, math.cos))
-        right = (0.25 * self.x * cosine - 0.25 * self.z * sine) / 4
-        ahead = (0.25 * self.x * sine + 0.25 * self.z * cosine) / 4
+        size = self.grid.grid_size
+        right = (size * self.x * cosine - size * self.z * sine) / 4
+        ahead = (size * self.x * sine + size * self.z * cosine) / 4
+        down = self.grid.horizons[self.horizon] / 30
         last = [float(self.action == action) for action in range(6)]
-        return [right, ahead, sine, cosine, self.horizon, self.was_blocked, *last]
+        return [right, ahead, sine, cosine, down, self.was_blocked, *last]
 
     def cell(self, row: int, column: int) -> tuple[int, int]:
         """The cell of the map that the window shows there: the nearest one."""
@@ -97,6 +110,12 @@ class SlowOdometry:
         z = self.z + round(ahead * cosine - right * sine)
         return x % 64, z % 64
 
+    def certain(self) -> np.ndarray:
+        """The cells of the window to which no two cells of the map are as near: [9, 9] bool."""
+        row, column = np.mgrid[:9, :9]
+        at = (column - 4 + 1j * (4 - row)) * np.exp(-1j * np.radians(self.heading))
+        return (np.abs(np.stack([at.real, at.imag]) % 1 - 0.5) > 1e-6).all(axis=0)
+
     def window(self) -> list[list[int]]:
         """The bits of the 9 x 9 cells."""
         rows = [[0] * 9 for _ in range(9)]
@@ -105,7 +124,7 @@ class SlowOdometry:
                 x, z = self.cell(row, column)
                 bits = BLOCKED if (x, z) in self.in_the_way else 0
                 for bit in range(8):
-                    if (x, z, (self.heading + 45 * bit) % 360) in self.stood:
+                    if (x, z, (nearest(self.heading) + 45 * bit) % 360) in self.stood:
                         bits += 1 << bit
                 rows[row][column] = bits
         return rows
@@ -165,6 +184,44 @@ def test_every_step_is_that_of_the_slow_odometry(diagonal: bool, horizon: int, r
         np.testing.assert_allclose(seen.motion[t], slow.motion(), atol=2e-6)
         np.testing.assert_array_equal(seen.window[t], slow.window())
     assert last.cells.shape == (64, 64)
+
+
+@pytest.mark.parametrize(
+    "grid",
+    [
+        PoseGrid(0.5, 4, (0,)),
+        PoseGrid(0.25, 6, (0, 30)),
+        PoseGrid(0.1, 12, (-30, 0, 30)),
+        PoseGrid(0.25, 24, (-15, 0, 60)),
+    ],
+    ids=str,
+)
+def test_on_other_grids_too_and_the_networks_input_stays_as_long(grid: PoseGrid) -> None:
+    spec = ObservationSpec(sensors=("odometry",), grid=grid)
+    sensor = suite.make(spec)["odometry"]
+    assert suite.width(spec) == SENSOR.width
+    update, read = jax.jit(lambda s, a, b: sensor.update(s, Motion(a, b), {})), jax.jit(sensor.read)
+    actions, blocked = wandering(grid.rotations, 60)
+    for rotation in range(grid.rotations):
+        state = sensor.init(Start(jnp.int32(rotation), jnp.int32(grid.level)))
+        # In its own frame it starts along an axis, or as far from one as it does in the room.
+        own = grid.turn * int(state.heading)
+        assert (own - grid.turn * rotation) % 90 == 0
+        assert own < (180 if grid.turn == 60 else 90)
+        if rotation > 3:
+            continue
+        slow = SlowOdometry(False, grid.level, grid, own)
+        for action, flag in zip(actions, blocked, strict=True):
+            state = update(state, jnp.int32(action), jnp.bool_(flag))
+            slow.update(int(action), bool(flag))
+            seen = read(state, {})
+            assert state.cell.tolist() == [slow.x, slow.z]
+            np.testing.assert_allclose(seen.motion, slow.motion(), atol=2e-6)
+            certain = slow.certain()
+            assert certain.mean() > 0.6
+            np.testing.assert_array_equal(
+                np.where(certain, seen.window, 0), np.where(certain, slow.window(), 0)
+            )
 
 
 def wandering(seed: int, length: int) -> tuple[np.ndarray, np.ndarray]:

@@ -20,6 +20,7 @@ from tdanet_jax.env.params import make_params
 from tdanet_jax.env.reward import no_parents
 from tdanet_jax.env.types import EnvParams, EnvState
 from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.sensors import suite
 from tdanet_jax.sensors.odometry import Odometry, OdometryReading, OdometryState
@@ -825,3 +826,35 @@ def test_without_triangulation_everything_else_is_the_same(some_rooms: SceneTabl
     tracking = tracking._replace(state=without(tracking.state))
     chex.assert_trees_all_equal(tracking, plain)
     chex.assert_trees_all_equal(without(more), obs)
+
+
+@pytest.mark.parametrize(
+    "grid",
+    [PoseGrid(0.5, 4, (-60, 0)), PoseGrid(0.1, 12, (-60, 0, 20)), PoseGrid(0.25, 24, (-60, 0))],
+    ids=str,
+)
+def test_on_other_grids_the_estimate_is_where_the_target_is(grid: PoseGrid) -> None:
+    """Seen level and, from three steps on, looking up by 60 degrees; then from a quarter turn."""
+    spec = ObservationSpec(sensors=SPEC.sensors, grid=grid)
+    target, at = np.array([-0.1, 1.2, 1.4]), 3 * grid.grid_size  # right, up, ahead; metres ahead
+
+    def frame(ahead: float, down: float, seen: bool = True) -> Frame:
+        right, up, away = target - (0, 0, ahead)
+        cosine, sine = math.cos(math.radians(down)), math.sin(math.radians(down))
+        depth, height = away * cosine - up * sine, up * cosine + away * sine
+        box = [(1 + right / depth) / 2, (1 - height / depth) / 2, 0.01]
+        return Frame(jnp.ones(1, int), jnp.array([box]), jnp.array([seen]), jnp.int32(1))
+
+    states = suite.init(spec, Start(jnp.int32(0), jnp.int32(1)))
+    states = suite.observe(spec, states, frame(0, 0))
+    turns = [ROTATE_RIGHT] * (grid.rotations // 4)
+    for action in [MOVE_AHEAD] * 3 + [LOOK_UP]:
+        states = suite.update(spec, states, Motion(jnp.int32(action), jnp.bool_(False)))
+    states = suite.observe(spec, states, frame(at, -60))
+    x, up, z, *_ = suite.read(spec, states)["triangulation"]
+    np.testing.assert_allclose([4 * x, 4 * up, 4 * z], target - (0, 0, at), atol=0.05)
+    for action in turns:
+        states = suite.update(spec, states, Motion(jnp.int32(action), jnp.bool_(False)))
+        states = suite.observe(spec, states, frame(at, 0, seen=False))
+    x, up, z, *_ = suite.read(spec, states)["triangulation"]
+    np.testing.assert_allclose([4 * x, 4 * up, 4 * z], [at - 1.4, 1.2, -0.1], atol=0.05)

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from hypothesis import strategies as st
 
+from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.scenes import SceneTables
 from tests.support.oracle import ROOMS, World
 
@@ -29,13 +30,17 @@ class Room:
     """One room, all indices counted from its own first entry."""
 
     kind: str
-    next_position: Sequence[Sequence[int]]  # [P][8], by heading
+    next_position: Sequence[Sequence[int]]  # [P][rotations], by heading
     objects: Sequence[tuple[str, tuple[float, float, float]]]  # class and centre in metres
     sightings: Mapping[int, Sequence[Sighting]]  # state -> what is in view
 
 
 def tables_of(
-    rooms: Sequence[Room], classes: Sequence[str], targets: Sequence[str], seed: int = 0
+    rooms: Sequence[Room],
+    classes: Sequence[str],
+    targets: Sequence[str],
+    seed: int = 0,
+    grid: PoseGrid = ITHOR,
 ) -> SceneTables:
     """Scene tables of some rooms. Distances are the oracle's; the raster is noise from `seed`."""
     positions = [len(room.next_position) for room in rooms]
@@ -45,13 +50,13 @@ def tables_of(
     index = {name: i for i, name in enumerate(classes)}
     rows: list[list[tuple[int, Sighting]]] = []
     for room, offset in zip(rooms, first_object, strict=False):
-        for state in range(len(room.next_position) * 16):
+        for state in range(len(room.next_position) * grid.views):
             found = room.sightings.get(state, ())
             found = sorted(found, key=lambda s: (index[room.objects[s.item][0]], s.item))
             rows.append([(int(offset) + s.item, s) for s in found])
     flat = [entry for state in rows for entry in state]
     all_objects = [item for room in rooms for item in room.objects]
-    states = 16 * sum(positions)
+    states = grid.views * sum(positions)
     centre = np.array([place for _, place in all_objects], float).reshape(-1, 3)
     rng = np.random.default_rng(seed)
     tables = SceneTables(
@@ -77,6 +82,7 @@ def tables_of(
         object_box=np.concatenate([centre - 0.1, centre + 0.1], axis=1),
         distance=np.full((states, len(targets)), -1, np.int16),
         raster=rng.integers(-1, len(classes), (states, 7, 7)).astype(np.int8),
+        grid=grid,
     )
     world = World(tables, {}, (1, 1, 1, 1))
     for goal, target in enumerate(targets):
@@ -123,7 +129,7 @@ def lopsided() -> SceneTables:
 
 @st.composite
 def random_tables(draw: st.DrawFn) -> SceneTables:
-    """Tables of up to four rooms with arbitrary moves (one-way ones included) and detections.
+    """Tables of up to four rooms with arbitrary turns, moves (one-way ones too) and detections.
 
     Sizes are drawn, contents follow from a drawn seed. More than 32 classes occur, so that bit
     sets take two words; so do empty frames, invisible targets and unreachable ones.
@@ -132,15 +138,19 @@ def random_tables(draw: st.DrawFn) -> SceneTables:
     largest = draw(st.integers(1, 4), label="most positions of a room")
     classes = [f"Class{i:02}" for i in range(draw(st.sampled_from((3, 34)), label="classes"))]
     density = draw(st.sampled_from((0.03, 0.2, 0.6)), label="share of objects in view")
+    grid = PoseGrid(
+        rotations=draw(st.sampled_from((8, 4, 12)), label="rotations"),
+        horizons=draw(st.sampled_from(((0, 30), (0,), (-30, 0, 30))), label="horizons"),
+    )
     seed = draw(st.integers(0, 2**32 - 1), label="seed")
     rng = np.random.default_rng(seed)
     rooms = []
     for kind in kinds:
         count = int(rng.integers(1, largest + 1))
         ahead = np.where(
-            rng.random((count, 8)) < 0.5,
+            rng.random((count, grid.rotations)) < 0.5,
             np.arange(count)[:, None],
-            rng.integers(count, size=(count, 8)),
+            rng.integers(count, size=(count, grid.rotations)),
         )
         objects = [
             (str(rng.choice(classes)), tuple(rng.uniform(0, 4, 3)))
@@ -152,14 +162,14 @@ def random_tables(draw: st.DrawFn) -> SceneTables:
                 for item in range(len(objects))
                 if rng.random() < density
             ]
-            for place in range(16 * count)
+            for place in range(grid.views * count)
         }
         rooms.append(Room(kind, ahead.tolist(), objects, sightings))
     # One target is always in view somewhere, so that an episode is possible.
     rooms[0].sightings[0] = [Sighting(0, _random_box(rng), True)]
     always = rooms[0].objects[0][0]
     others = [str(name) for name in rng.permutation([c for c in classes if c != always])[:4]]
-    return tables_of(rooms, classes, [always, *others], seed)
+    return tables_of(rooms, classes, [always, *others], seed, grid)
 
 
 def _random_box(rng: np.random.Generator) -> tuple[int, int, int, int]:

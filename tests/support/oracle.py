@@ -11,7 +11,7 @@ import dataclasses
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,16 @@ class Pose(NamedTuple):
     position: int  # index of the reachable point
     heading: int  # degrees, clockwise from +z
     horizon: int  # degrees, downwards
+
+
+class Turns(NamedTuple):
+    """What an agent's rotations and horizons are; a table's own grid has the same two fields."""
+
+    rotations: int = 8
+    horizons: tuple[int, ...] = (0, 30)  # degrees, downwards
+
+
+ITHOR = Turns()
 
 
 class Detection(NamedTuple):
@@ -64,14 +74,22 @@ class Outcome(NamedTuple):
     success: bool
 
 
-def state_of(pose: Pose) -> int:
+def views_of(turns: Any = ITHOR) -> list[tuple[int, int]]:
+    """Heading and horizon of all poses at a position, in their order, in degrees."""
+    headings = range(0, 360, 360 // turns.rotations)
+    return [(heading, horizon) for heading in headings for horizon in turns.horizons]
+
+
+def state_of(pose: Pose, turns: Any = ITHOR) -> int:
     """The pose's index in the tables."""
-    return (pose.position * 8 + HEADINGS.index(pose.heading)) * 2 + (0, 30).index(pose.horizon)
+    views = views_of(turns)
+    return pose.position * len(views) + views.index((pose.heading, pose.horizon))
 
 
-def pose_of(state: int) -> Pose:
+def pose_of(state: int, turns: Any = ITHOR) -> Pose:
     """The pose that the tables call `state`."""
-    return Pose(state // 16, HEADINGS[state // 2 % 8], (0, 30)[state % 2])
+    views = views_of(turns)
+    return Pose(state // len(views), *views[state % len(views)])
 
 
 class World:
@@ -98,10 +116,19 @@ class World:
         self.step_limits = step_limits
         self.ahead = ahead or self.ahead_in_table
         self.similarity = similarity
+        self.turn = 360 // tables.grid.rotations
+
+    def state_of(self, pose: Pose) -> int:
+        """The pose's index in the tables."""
+        return state_of(pose, self.tables.grid)
+
+    def pose_of(self, state: int) -> Pose:
+        """The pose that the tables call `state`."""
+        return pose_of(state, self.tables.grid)
 
     def ahead_in_table(self, position: int, heading: int) -> int:
         """The point that the tables name as next."""
-        return int(self.tables.next_position[position, HEADINGS.index(heading)])
+        return int(self.tables.next_position[position, heading // self.turn])
 
     def moved(self, pose: Pose, action: int) -> Pose:
         """The pose after an action; an impossible one leaves it as it is."""
@@ -109,13 +136,16 @@ class World:
         if name == "MoveAhead":
             return pose._replace(position=self.ahead(pose.position, pose.heading))
         if name == "RotateLeft":
-            return pose._replace(heading=(pose.heading - 45) % 360)
+            return pose._replace(heading=(pose.heading - self.turn) % 360)
         if name == "RotateRight":
-            return pose._replace(heading=(pose.heading + 45) % 360)
+            return pose._replace(heading=(pose.heading + self.turn) % 360)
+        horizons = self.tables.grid.horizons
         if name == "LookUp":
-            return pose._replace(horizon=0)
+            higher = [horizon for horizon in horizons if horizon < pose.horizon]
+            return pose._replace(horizon=max(higher, default=pose.horizon))
         if name == "LookDown":
-            return pose._replace(horizon=30)
+            lower = [horizon for horizon in horizons if horizon > pose.horizon]
+            return pose._replace(horizon=min(lower, default=pose.horizon))
         return pose
 
     def rows(self, state: int) -> list[int]:
@@ -162,7 +192,7 @@ class World:
         episode.steps += 1
         limit = self.step_limits[ROOMS.index(self.room(episode.pose.position))]
         timed_out = action != DONE and episode.steps >= limit
-        success = action == DONE and episode.target in self.visible(state_of(episode.pose))
+        success = action == DONE and episode.target in self.visible(self.state_of(episode.pose))
         partial = self.seen_parents if self.similarity is None else self.seen_likeness
         new, anyway = partial(episode)
         if action == DONE:
@@ -171,7 +201,7 @@ class World:
 
     def seen_parents(self, episode: Episode) -> tuple[float | None, float]:
         """R_p of the parents that are visible for the first time, and of all that are visible."""
-        visible = self.visible(state_of(episode.pose))
+        visible = self.visible(self.state_of(episode.pose))
         worth = self.parents.get(episode.target, {})
         in_view = {name for name in worth if name in visible}
         new = in_view - episode.parents_seen
@@ -183,7 +213,7 @@ class World:
         """0.1 times the largest cosine in view: if it has risen, and in any case."""
         assert self.similarity is not None
         cosines = self.similarity[episode.target]
-        rows = self.rows(state_of(episode.pose))
+        rows = self.rows(self.state_of(episode.pose))
         greatest = max((cosines[self.class_of(row)] for row in rows), default=0.0)
         risen = greatest > episode.most_similar
         episode.most_similar = max(greatest, episode.most_similar)
@@ -196,9 +226,9 @@ class World:
         queue: deque[int] = deque()
         away: dict[int, int] = {}
         for position in np.flatnonzero(self.tables.position_scene == scene):
-            for state in range(position * 16, position * 16 + 16):
+            for state in self.states_at(position):
                 for action in MOVES:
-                    after = state_of(self.moved(pose_of(state), action))
+                    after = self.state_of(self.moved(self.pose_of(state), action))
                     came_from.setdefault(after, []).append(state)
                 if target in self.visible(state):
                     away[state] = 0
@@ -213,16 +243,16 @@ class World:
 
     def distance(self, state: int, target: str) -> int | None:
         """Fewest moves from a state until the target is visible, None if there is none."""
-        scene = int(self.tables.position_scene[state // 16])
+        scene = int(self.tables.position_scene[self.pose_of(state).position])
         return self.distances(scene, target).get(state)
 
     def best_action(self, pose: Pose, target: str) -> int:
         """An action on a shortest path; Done where the target is visible."""
-        here = self.distance(state_of(pose), target)
+        here = self.distance(self.state_of(pose), target)
         if here is None:
             raise ValueError(f"{target} cannot be reached from {pose}")
         for action in MOVES if here else ():
-            if self.distance(state_of(self.moved(pose, action)), target) == here - 1:
+            if self.distance(self.state_of(self.moved(pose, action)), target) == here - 1:
                 return action
         return DONE
 
@@ -230,20 +260,26 @@ class World:
         """Positions of a scene from which the target can be reached, looking level."""
         positions = np.flatnonzero(self.tables.position_scene == scene)
         reached = self.distances(scene, target)
-        return {int(p) for p in positions if any(state in reached for state in level_states(p))}
+        return {
+            int(p) for p in positions if any(state in reached for state in self.level_states(p))
+        }
 
     def valid_targets(self, scene: int, among: Sequence[str]) -> list[str]:
         """The targets that can be reached from somewhere in a scene."""
         return [target for target in among if self.valid_starts(scene, target)]
 
+    def states_at(self, position: int) -> list[int]:
+        """The states of a position."""
+        views = views_of(self.tables.grid)
+        return [self.state_of(Pose(int(position), *view)) for view in views]
 
-def level_states(position: int) -> list[int]:
-    """The eight states of a position that look level."""
-    return [state_of(Pose(int(position), heading, 0)) for heading in HEADINGS]
+    def level_states(self, position: int) -> list[int]:
+        """The states of a position that look level."""
+        return [s for s in self.states_at(position) if self.pose_of(s).horizon == 0]
 
 
 def walk_on_grid(tables: SceneTables) -> Callable[[int, int], int]:
-    """Where MoveAhead leads, from coordinates: 0.25 m along the heading, oblique on both axes."""
+    """Where MoveAhead leads, from coordinates: to the neighbour that is nearest to the heading."""
     index = {
         (int(scene), round(float(x), 2), round(float(z), 2)): i
         for i, (scene, (x, _, z)) in enumerate(
@@ -253,10 +289,11 @@ def walk_on_grid(tables: SceneTables) -> Callable[[int, int], int]:
 
     def ahead(position: int, heading: int) -> int:
         x, _, z = tables.position[position]
-        east = {0: 0, 45: 1, 90: 1, 135: 1, 180: 0, 225: -1, 270: -1, 315: -1}[heading]
-        north = {0: 1, 45: 1, 90: 0, 135: -1, 180: -1, 225: -1, 270: 0, 315: 1}[heading]
-        scene = int(tables.position_scene[position])
-        place = (scene, round(float(x) + 0.25 * east, 2), round(float(z) + 0.25 * north, 2))
+        nearest = min((*HEADINGS, 360), key=lambda direction: abs(direction - heading)) % 360
+        east = {0: 0, 45: 1, 90: 1, 135: 1, 180: 0, 225: -1, 270: -1, 315: -1}[nearest]
+        north = {0: 1, 45: 1, 90: 0, 135: -1, 180: -1, 225: -1, 270: 0, 315: 1}[nearest]
+        scene, size = int(tables.position_scene[position]), tables.grid.grid_size
+        place = (scene, round(float(x) + size * east, 2), round(float(z) + size * north, 2))
         return index.get(place, position)
 
     return ahead

@@ -6,6 +6,7 @@ import numpy as np
 
 from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.vocabulary import ROOM_TYPES
 
 AGENT = 0.9  # metres, y of an agent that stands on a floor at 0
 CAMERA = 1.575  # metres, y of its camera
@@ -39,7 +40,7 @@ def thing(
 def room(spots: np.ndarray, *objects: SceneObject, name: str = "Toy", room_type: int = 0) -> Scene:
     """A room of some reachable points and objects; objects are put in order."""
     ordered = sorted(objects, key=lambda item: (item.object_class, item.object_id))
-    return Scene(name, room_type, spots, tuple(ordered))
+    return Scene(name, ROOM_TYPES[room_type], spots, tuple(ordered))
 
 
 def corridor() -> Scene:

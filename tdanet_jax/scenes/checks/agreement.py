@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdanet_jax import poses
 from tdanet_jax.scenes.scene import Scene
 from tdanet_jax.scenes.visibility.build import detect
 from tdanet_jax.scenes.visibility.rules import Rules
@@ -54,7 +53,7 @@ def default_frame(scene: Scene, rules: Rules) -> np.ndarray:
     assert scene.default_position is not None
     assert scene.default_rotation is not None
     found = detect(scene, rules, scene.default_position[None])
-    view = poses.from_degrees(0, scene.default_rotation, 0)
+    view = scene.grid.from_degrees(0, scene.default_rotation, 0)
     result = np.zeros(len(scene.objects), bool)
     result[found.owner[(found.state == view) & found.visible]] = True
     return result

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdanet_jax import poses
 from tdanet_jax.scenes.checks.agreement import Confusion
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene
 from tdanet_jax.scenes.visibility.build import detect
@@ -32,9 +31,9 @@ class DenseView:
 
 def dense_view(scene: Scene, rules: Rules, state: int, pixels: int = 150) -> DenseView:
     """The view of `state` of a room with pixels x pixels rays, in float64."""
-    pose = poses.split(state)
+    pose = scene.grid.split(state)
     camera = scene.points[pose.position] + np.array([0, CAMERA_ABOVE_AGENT, 0])
-    turn, tilt = np.radians(pose.degrees)
+    turn, tilt = np.radians(scene.grid.degrees(pose))
     rays = _pixel_rays(turn, tilt, pixels)
     occluders = _float_solids(scene, rules)
     share = np.zeros(len(scene.objects))
@@ -165,7 +164,7 @@ def summary(rooms: Sequence[Scene], rules: Rules, count: int, views: int) -> str
     overlaps: list[float] = []
     classes = Confusion()
     for i in np.linspace(0, len(rooms) - 1, count).astype(int):
-        states = rng.choice(len(rooms[i].points) * poses.VIEWS, views, replace=False)
+        states = rng.choice(len(rooms[i].points) * rooms[i].grid.views, views, replace=False)
         more, case = compare_boxes(rooms[i], rules, states)
         overlaps += more
         classes += case

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +15,8 @@ from tdanet_jax import words
 from tdanet_jax.scenes.dataset import Rooms, assign_rooms
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.visibility.rules import RULES
-from tdanet_jax.splits import make_split
-from tdanet_jax.vocabulary import ROOM_TYPES, TARGETS
+from tdanet_jax.splits import Split, make_split
+from tdanet_jax.vocabulary import ROOM_TYPES
 
 
 @dataclass(frozen=True)
@@ -100,19 +100,23 @@ def uses(rooms: Rooms) -> Iterator[str]:
     train = [name for name in tables.scenes if name in split.train_scenes]
     test = [name for name in tables.scenes if name in split.eval_scenes]
     yield f"Rooms to train in: {len(train)}; to be evaluated in: {len(test)}"
+    for room in tables.room_types[len(ROOM_TYPES) :]:
+        yield f"Targets in rooms of type {room}: {_listed(split.seen[room])}"
     unused = [name for name in tables.scenes if name not in {*train, *test}]
     if unused or not train or not test:
         named = f"no split uses {', '.join(unused)}; " if unused else ""
         warnings.warn(
             f"{named}a run needs a room to train in and one to be evaluated in: by the names of "
-            'iTHOR\'s rooms, or by "split": "train" or "test" in the scene file',
+            'iTHOR\'s rooms, by "split": "train" or "test" in the scene file, by --part or --rooms',
             stacklevel=2,
         )
     purposes = {"train in": train, "be evaluated in": test}
-    empty = [use for use, names in purposes.items() if names and not _hold_target(tables, names)]
+    empty = [
+        use for use, names in purposes.items() if names and not _hold_target(tables, names, split)
+    ]
     if empty:
-        types = [room for i, room in enumerate(ROOM_TYPES) if i in tables.room_type]
-        listed = "; ".join(f"in a {room}, {', '.join(TARGETS[room])}" for room in types)
+        types = [room for i, room in enumerate(tables.room_types) if i in tables.room_type]
+        listed = "; ".join(f"in a {room}, {_listed(split.seen[room])}" for room in types)
         warnings.warn(
             f"no room to {' or to '.join(empty)} holds a target that can be found there, and a run "
             f"needs one: {listed}",
@@ -124,10 +128,14 @@ def uses(rooms: Rooms) -> Iterator[str]:
         yield f"Needs --word-vectors: no bundled ones for {', '.join(lacking)}"
 
 
-def _hold_target(tables: SceneTables, rooms: Iterable[str]) -> bool:
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names) or "none"
+
+
+def _hold_target(tables: SceneTables, rooms: Iterable[str], split: Split) -> bool:
     """Whether an episode can start in any of these rooms."""
     for room in map(tables.scenes.index, rooms):
-        targets = TARGETS[ROOM_TYPES[tables.room_type[room]]]
+        targets = split.seen[tables.room_types[tables.room_type[room]]]
         goals = [tables.targets.index(name) for name in targets if name in tables.targets]
         if tables.reachable[tables.position_scene == room][:, goals].any():
             return True

@@ -13,6 +13,7 @@ import numpy as np
 
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import hdf5
+from tdanet_jax.poses import ITHOR
 from tdanet_jax.scenes.offline import layout
 from tdanet_jax.scenes.offline.connected import Connected, largest_parts
 from tdanet_jax.scenes.offline.layout import Report, state_keys
@@ -75,6 +76,14 @@ def write_folder(
         return connected
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def check_layout(tables: SceneTables) -> None:
+    """Raises ValueError if the original layout cannot hold these rooms."""
+    own = [tables.room_types[kind] for kind in tables.room_type if kind >= len(ROOM_TYPES)]
+    if own or tables.grid != ITHOR:
+        what = f"rooms of type {own[0]}" if own else "rooms on another grid than iTHOR's"
+        raise ValueError(f"{what}: the original layout has iTHOR's room types and grid alone")
 
 
 def write_scene(room: SceneTables, folder: Path) -> None:

@@ -71,7 +71,7 @@ def read_folder(
     # The reference keeps its test episodes two folders above the scenes.
     places = [root, folder, folder / "data", *root.resolve().parents[:2]]
     extras, lines = read_extras(places, known)
-    parts = {scene.name: scene.kind.part for scene in chosen if scene.kind.part is not None}
+    parts = {scene.name: scene.part for scene in chosen if scene.part is not None}
     extras = dataclasses.replace(extras, parts=parts)
     for line in (*left_out, *lines):
         report(1.0, line)
@@ -113,13 +113,13 @@ def _cache_folder(root: Path) -> Path:
 def _read_cached(cached: Path, scene: SceneFolder, frame: Frame | None) -> tuple[SceneTables, str]:
     """A scene and a line on it, cached if it was read from files of equal sizes and dates."""
     path = cached / f"{scene.name}.npz"
-    stamp = [scene.kind.room_type, str(frame), *_stamp(scene.path)]
+    stamp = [scene.room_type, str(frame), *_stamp(scene.path)]
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         arrays = npz.read(path)
         note = json.loads(arrays["import/note"].tobytes())
         if note["stamp"] == stamp:
             return SceneTables.from_arrays(arrays), note["line"]
-    data = read_scene(scene.path, scene.name, scene.kind.room_type, frame)
+    data = read_scene(scene.path, scene.name, scene.room_type, frame)
     room = tabulate(data.scene, data.next_position, data.detections, ALL_TARGETS)
     note = json.dumps({"stamp": stamp, "line": data.describe()}).encode()
     with contextlib.suppress(OSError):  # without a cache, an import starts again

@@ -13,7 +13,7 @@ from tdanet_jax import poses
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes.metadata import ALIGNED
-from tdanet_jax.scenes.room_names import Kinds, RoomKind, check_name, kind_of, sort_key
+from tdanet_jax.scenes.room_names import Kinds, check_name, kind_of, sort_key, type_names
 from tdanet_jax.scenes.scene import SceneError
 
 GRID_FILE, GRAPH_FILE, BOX_FILE = "grid.json", "graph.json", "objects_bb.json"
@@ -39,7 +39,8 @@ class SceneFolder(NamedTuple):
     """A folder with the files of a scene."""
 
     name: str
-    kind: RoomKind
+    room_type: str
+    part: str | None
     path: Path
 
 
@@ -90,18 +91,22 @@ def find_scenes(root: Path, kinds: Kinds | None = None) -> tuple[list[SceneFolde
             left_out.append(f"left out: {error}")
             continue
         kind = kinds.of(name)
-        if kind is None:
+        if kind.room_type is None:
             left_out.append(f"{name}: left out, --room-type or --rooms must say its type")
         elif name in found:
             raise FileError(place, f"{name} is there twice")
         else:
-            found[name] = SceneFolder(name, kind, place)
+            found[name] = SceneFolder(name, kind.room_type, kind.part, place)
     if rest := sorted(kinds.table.keys() - found.keys(), key=sort_key):
         listed = ", ".join(rest[:3]) + (", ..." if len(rest) > 3 else "")
         left_out.append(f"{len(rest)} rooms of the table of rooms are not in the folder: {listed}")
     if not found:
         raise FileError(root, f"no room to import; {left_out[0] if left_out else 'it is empty'}")
-    return sorted(found.values(), key=lambda s: (s.kind.room_type, sort_key(s.name))), left_out
+
+    types = type_names(scene.room_type for scene in found.values())
+    return sorted(
+        found.values(), key=lambda s: (types.index(s.room_type), sort_key(s.name))
+    ), left_out
 
 
 def state_key(x: float, z: float, rotation: int, horizon: int) -> str:
@@ -115,7 +120,7 @@ def state_key(x: float, z: float, rotation: int, horizon: int) -> str:
 def state_keys(points: np.ndarray) -> list[str]:
     """Keys of all P * 16 states at points [P, 3], in the order of the tables."""
     return [
-        state_key(float(x), float(z), *poses.split(view).degrees)
+        state_key(float(x), float(z), *poses.ITHOR.degrees(poses.split(view)))
         for x, _, z in points
         for view in range(poses.VIEWS)
     ]

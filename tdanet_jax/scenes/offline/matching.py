@@ -131,7 +131,7 @@ class BoxMatcher:
         near_first = sorted(names, key=lambda name: name not in visible)
         return list(zip(near_first, map(tuple, boxes[order].tolist()), strict=False))
 
-    def finish(self, name: str, room_type: int, points: np.ndarray) -> tuple[Scene, Detections]:
+    def finish(self, name: str, room_type: str, points: np.ndarray) -> tuple[Scene, Detections]:
         """The scene, with its objects by class and id, and all rows by state and object."""
         classes = self._objects.classes
         order = sorted(classes, key=lambda name: (classes[name], name))

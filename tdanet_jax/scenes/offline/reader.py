@@ -46,7 +46,7 @@ class SceneData:
         return f"{line}; noted: {', '.join(self.noted)}" if self.noted else line
 
 
-def read_scene(folder: Path, name: str, room_type: int, frame: Frame | None = None) -> SceneData:
+def read_scene(folder: Path, name: str, room_type: str, frame: Frame | None = None) -> SceneData:
     """Reads the files of a scene, one after the other.
 
     Args:

@@ -8,12 +8,12 @@ defines to the last bit, so that tables are equal on every machine.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from tdanet_jax import poses
-from tdanet_jax.poses import HORIZONS, VIEWS
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene
 from tdanet_jax.scenes.visibility import rays
 from tdanet_jax.scenes.visibility.geometry import gap_to_box
@@ -22,23 +22,45 @@ from tdanet_jax.scenes.visibility.solids import Patches, millimetres, patches_of
 from tdanet_jax.vocabulary import IMAGE_SIZE
 
 PAIRS = 1 << 21  # of a camera and a patch, in a batch
-# Cosine and sine of each horizon; IEEE 754 defines square roots to the last bit.
-TILTS = ((np.float32(1), np.float32(0)), (np.sqrt(np.float32(0.75)), np.float32(0.5)))
 
 
-def turned(x: np.ndarray, z: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Coordinates to the right of and ahead of a level camera, for each of the eight rotations."""
-    half = np.sqrt(np.float32(0.5))
-    plus, minus = (x + z) * half, (x - z) * half
-    half_turn = [(x, z), (minus, plus), (-z, x), (-plus, minus)]
-    return half_turn + [(-right, -ahead) for right, ahead in half_turn]
+def cosine_and_sine(degrees: int) -> tuple[np.float32, np.float32]:
+    """The float32 numbers nearest to those of whole degrees, on every machine.
+
+    Machines differ in the last bits of a float64 cosine. That does not show: no cosine of whole
+    degrees is so near to the middle between two float32 numbers.
+    """
+    angle = math.radians(degrees)
+    return np.float32(round(math.cos(angle), 14)), np.float32(round(math.sin(angle), 14))
 
 
-def tilted(up: np.ndarray, ahead: np.ndarray, horizon: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates above and ahead of the camera once it looks down to `horizon`."""
-    if horizon == 0:
+def turned(x: np.ndarray, z: np.ndarray, turn: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Coordinates to the right of and ahead of a level camera, every `turn` degrees all around."""
+    headings = []
+    for degrees in range(0, 360, turn):
+        right, ahead = _turned_within_quarter(x, z, degrees % 90)
+        for _ in range(degrees // 90):
+            right, ahead = -ahead, right
+        headings.append((right, ahead))
+    return headings
+
+
+def _turned_within_quarter(
+    x: np.ndarray, z: np.ndarray, degrees: int
+) -> tuple[np.ndarray, np.ndarray]:
+    cosine, sine = cosine_and_sine(degrees)
+    if degrees == 0:
+        return x, z
+    if degrees == 45:
+        return (x - z) * cosine, (x + z) * cosine
+    return x * cosine - z * sine, x * sine + z * cosine
+
+
+def tilted(up: np.ndarray, ahead: np.ndarray, degrees: int) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates above and ahead of the camera once it looks down by `degrees`."""
+    if degrees == 0:
         return up, ahead
-    cosine, sine = TILTS[horizon]
+    cosine, sine = cosine_and_sine(degrees)
     return cosine * up + sine * ahead, cosine * ahead - sine * up
 
 
@@ -77,7 +99,7 @@ def within_reach(scene: Scene, points: np.ndarray, patches: Patches, rules: Rule
 
 
 def detect(scene: Scene, rules: Rules, points: np.ndarray | None = None) -> Detections:
-    """The detections at `points` [P, 3] (by default the reachable ones) in all 16 views.
+    """The detections at `points` [P, 3] (by default the reachable ones) in all views.
 
     Memory is bounded: many points in a room of many patches are worked on in several batches.
     """
@@ -88,13 +110,18 @@ def detect(scene: Scene, rules: Rules, points: np.ndarray | None = None) -> Dete
     for first in range(0, len(points), batch):
         here = points[first : first + batch]
         near = within_reach(scene, here, patches, rules)
-        found = _detect(here, near, patches, solids, rules)
-        parts.append(found._replace(state=found.state + np.int32(first * VIEWS)))
+        found = _detect(scene.grid, here, near, patches, solids, rules)
+        parts.append(found._replace(state=found.state + np.int32(first * scene.grid.views)))
     return Detections(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _detect(
-    points: np.ndarray, near: np.ndarray, patches: Patches, solids: rays.Solids, rules: Rules
+    grid: PoseGrid,
+    points: np.ndarray,
+    near: np.ndarray,
+    patches: Patches,
+    solids: rays.Solids,
+    rules: Rules,
 ) -> Detections:
     """The detections at `points` [P, 3], from which the objects `near` [P, O] are within reach."""
     cameras = millimetres(points + np.array([0, CAMERA_ABOVE_AGENT, 0]))
@@ -107,10 +134,12 @@ def _detect(
     target = np.rint(patches.center).astype(np.int32)
     seen = ~rays.cast(cameras[position], target[patch], solids)
     least = np.where(near.reshape(-1) & (whole > 0), whole * rules.sliver, np.inf)
-    return _boxes_in_view(cameras, patches, position[seen], patch[seen], group[seen], least)
+    hidden_by_nothing = position[seen], patch[seen], group[seen]
+    return _boxes_in_view(grid, cameras, patches, *hidden_by_nothing, least)
 
 
 def _boxes_in_view(
+    grid: PoseGrid,
     cameras: np.ndarray,
     patches: Patches,
     position: np.ndarray,
@@ -128,13 +157,14 @@ def _boxes_in_view(
     area, owners = patches.area[patch], patches.owner[patch]
     center, corner, eye = (a.astype(np.float32) for a in (patches.center, patches.corner, cameras))
     x, up, z = (center[patch, axis] - eye[position, axis] for axis in range(3))
-    corners, eyes = turned(corner[..., 0], corner[..., 2]), turned(eye[:, 0], eye[:, 2])
+    corners = turned(corner[..., 0], corner[..., 2], grid.turn)
+    eyes = turned(eye[:, 0], eye[:, 2], grid.turn)
     corners_up, eyes_up = np.ascontiguousarray(corner[..., 1]), np.ascontiguousarray(eye[:, 1])
     none = np.zeros(0, np.int32)
     parts = [(none, none, np.zeros((0, 4), np.int16), np.zeros(0, bool))]
-    for heading, (right, ahead) in enumerate(turned(x, z)):
-        for horizon in range(HORIZONS):
-            height, depth = tilted(up, ahead, horizon)
+    for heading, (right, ahead) in enumerate(turned(x, z, grid.turn)):
+        for horizon, down in enumerate(grid.horizons):
+            height, depth = tilted(up, ahead, down)
             rows = np.flatnonzero((np.abs(right) < depth) & (np.abs(height) < depth))
             start = np.flatnonzero(np.diff(group[rows], prepend=-1))
             if len(rows) == 0:
@@ -148,8 +178,8 @@ def _boxes_in_view(
                 )
             )
             first = rows[start]
-            state = poses.join(position[first], heading, horizon)
-            box = _extents(across, *tilted(over, along, horizon), start)
+            state = grid.join(position[first], heading, horizon)
+            box = _extents(across, *tilted(over, along, down), start)
             visible = np.add.reduceat(area[rows], start) >= least[group[first]]
             parts.append((state, owners[first], box, visible))
     state, owner, box, visible = map(np.concatenate, zip(*parts, strict=True))

@@ -1,15 +1,14 @@
 """Boxes, their faces, and the graph of reachable points.
 
 World axes are AI2-THOR's: x right, y up, z forward, left-handed; metres. Headings count from
-+z clockwise seen from above (90 degrees looks along +x), in steps of 45 degrees.
++z clockwise seen from above (90 degrees looks along +x).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from tdanet_jax import poses
-from tdanet_jax.poses import GRID_SIZE, HORIZONS, ROTATIONS, STEPS
+from tdanet_jax.poses import ITHOR, STEPS, PoseGrid
 from tdanet_jax.scenes.scene import SceneObject
 
 THIN = 1e-3  # metres; a box that is thinner than this is taken to be this thick
@@ -54,32 +53,32 @@ def gap_to_box(item: SceneObject, points: np.ndarray) -> np.ndarray:
     return gap
 
 
-def next_positions(points: np.ndarray) -> np.ndarray:
-    """The position after MoveAhead from each of `points` [P, 3] along each heading: [P, 8] int32.
+def next_positions(points: np.ndarray, grid: PoseGrid = ITHOR) -> np.ndarray:
+    """The position after MoveAhead from each of `points` [P, 3]: [P, rotations] int32.
 
     A step towards a point that is not reachable leaves the agent where it is.
     """
-    cells = np.rint((points - points[0])[:, [0, 2]] / GRID_SIZE).astype(np.int64)
+    cells = np.rint((points - points[0])[:, [0, 2]] / grid.grid_size).astype(np.int64)
     index = {(int(x), int(z)): i for i, (x, z) in enumerate(cells)}
-    result = np.empty((len(points), ROTATIONS), np.int32)
+    result = np.empty((len(points), grid.rotations), np.int32)
     for i, (x, z) in enumerate(cells):
-        for heading, (dx, dz) in enumerate(STEPS):
+        for heading, (dx, dz) in enumerate(grid.steps):
             result[i, heading] = index.get((int(x + dx), int(z + dz)), i)
     return result
 
 
-def transitions(next_position: np.ndarray) -> np.ndarray:
-    """State after each of the five moving actions: [S, 5] int32, S = P * 16.
+def transitions(next_position: np.ndarray, grid: PoseGrid = ITHOR) -> np.ndarray:
+    """State after each of the five moving actions: [S, 5] int32.
 
     Columns are MoveAhead, RotateLeft, RotateRight, LookUp, LookDown.
     """
-    position, rotation, horizon = poses.split(np.arange(next_position.size * HORIZONS))
+    position, rotation, horizon = grid.split(np.arange(len(next_position) * grid.views))
     columns = [
-        poses.join(next_position[position, rotation], rotation, horizon),
-        poses.join(position, (rotation - 1) % ROTATIONS, horizon),
-        poses.join(position, (rotation + 1) % ROTATIONS, horizon),
-        poses.join(position, rotation, 0),
-        poses.join(position, rotation, 1),
+        grid.join(next_position[position, rotation], rotation, horizon),
+        grid.join(position, (rotation - 1) % grid.rotations, horizon),
+        grid.join(position, (rotation + 1) % grid.rotations, horizon),
+        grid.join(position, rotation, np.maximum(horizon - 1, 0)),
+        grid.join(position, rotation, np.minimum(horizon + 1, len(grid.horizons) - 1)),
     ]
     return np.stack(columns, axis=1).astype(np.int32)
 
@@ -136,7 +135,7 @@ def frustum_rotation(points: np.ndarray, visible: np.ndarray, camera: np.ndarray
     """
     offset = points - camera
     scores = []
-    for heading in range(0, ROTATIONS, 2):
+    for heading in range(0, len(STEPS), 2):
         x, z = STEPS[heading]
         depth = offset[..., 0] * x + offset[..., 2] * z
         side = offset[..., 0] * z - offset[..., 2] * x

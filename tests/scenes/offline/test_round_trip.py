@@ -273,8 +273,8 @@ def test_scenes_that_changed_are_read_again(
     monkeypatch.setattr(
         importer, "read_scene", lambda *given: (read.append(given[1]), plain(*given))[1]
     )
-    scene = SceneFolder("FloorPlan1", RoomKind(0, None), place)
-    bathroom = scene._replace(kind=RoomKind(3, None))
+    scene = SceneFolder("FloorPlan1", "kitchen", None, place)
+    bathroom = scene._replace(room_type="bathroom")
     for times, change, folder, frame in (
         (1, lambda: None, scene, None),
         (1, lambda: None, scene, None),
@@ -326,9 +326,9 @@ def test_rooms_of_any_name(tmp_path: Path) -> None:
         "start or end",
     ]
 
-    table = {"Lab [bold]": RoomKind(2, "test"), "FloorPlan30-1": RoomKind(1, None),
-             "Nowhere": RoomKind(0, None)}  # fmt: skip
-    kinds = Kinds(table, RoomKind(1, "train"))
+    table = {"Lab [bold]": RoomKind("bedroom", "test"), "FloorPlan30-1": RoomKind("living_room", None),
+             "Nowhere": RoomKind("kitchen", None)}  # fmt: skip
+    kinds = Kinds(table, RoomKind("living_room", "train"))
     back = importer.read_folder(source, lambda share, line: lines.append(line), kinds)
     assert dict(zip(back.tables.scenes, back.tables.room_type.tolist(), strict=True)) == {
         "FloorPlan2-2": 0, "FloorPlan2-10": 0, "FloorPlan5": 0, "FloorPlan_Train1_1": 1,

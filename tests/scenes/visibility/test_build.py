@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tdanet_jax.poses import TURNS, PoseGrid
 from tdanet_jax.scenes import ithor
 from tdanet_jax.scenes.checks import agreement, dense_rays
 from tdanet_jax.scenes.scene import Scene, SceneObject
 from tdanet_jax.scenes.visibility import build
-from tdanet_jax.scenes.visibility.build import detect
+from tdanet_jax.scenes.visibility.build import cosine_and_sine, detect, tilted, turned
 from tdanet_jax.scenes.visibility.rules import RULES, Rules
 from tdanet_jax.scenes.visibility.solids import fronts_of, patches_of, solids_of, void_boxes
 from tests.support import toy
@@ -62,6 +64,58 @@ def test_headings_turn_clockwise_from_z(heading: int) -> None:
         assert (right["Apple"][0][0] + right["Apple"][0][2]) / 2 > 2 * MIDDLE * 0.9
 
 
+def test_cosines_are_the_nearest_numbers_whatever_the_last_bits_of_the_machines() -> None:
+    for degrees in range(-90, 361):
+        for value, exact in zip(
+            cosine_and_sine(degrees),
+            (math.cos(math.radians(degrees)), math.sin(math.radians(degrees))),
+            strict=True,
+        ):
+            assert value == np.float32(exact + 1e-12) or abs(exact) < 1e-9
+            assert value == np.float32(exact - 1e-12) or abs(exact) < 1e-9
+    half = np.sqrt(np.float32(0.5))
+    assert cosine_and_sine(45) == (half, half)
+    assert cosine_and_sine(30) == (np.sqrt(np.float32(0.75)), np.float32(0.5))
+    assert cosine_and_sine(90) == (0, 1)
+    assert all(type(value) is np.float32 for value in cosine_and_sine(60))
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_cameras_turn_and_tilt_by_whole_degrees(turn: int) -> None:
+    x, up, z = np.random.default_rng(turn).normal(size=(3, 50)).astype(np.float32)
+    found = turned(x, z, turn)
+    assert len(found) == 360 // turn
+    for i, (right, ahead) in enumerate(found):
+        rotated = (x + 1j * z) * np.exp(1j * np.radians(turn * i))
+        np.testing.assert_allclose(right + 1j * ahead, rotated, atol=1e-6)
+        assert right.dtype == np.float32
+    above, ahead = tilted(up, z, turn - 60)
+    lifted = (z + 1j * up) * np.exp(1j * np.radians(turn - 60))
+    np.testing.assert_allclose(ahead + 1j * above, lifted, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "other", [PoseGrid(rotations=12, horizons=(-30, 0, 30)), PoseGrid(0.25, 4, (0,))]
+)
+def test_common_views_of_two_grids_are_the_same(other: PoseGrid) -> None:
+    rng = np.random.default_rng(4)
+    for room in (toy.corridor(), toy.random_room(rng)):
+        mine = detect(room, BARE)
+        theirs = detect(dataclasses.replace(room, grid=other), BARE)
+        compared = 0
+        for position in range(len(room.points)):
+            for rotation in (0, 90, 180, 270):
+                for horizon in set(room.grid.horizons) & set(other.horizons):
+                    rows = [
+                        found.state == grid.from_degrees(position, rotation, horizon)
+                        for found, grid in ((mine, room.grid), (theirs, other))
+                    ]
+                    for a, b in zip(mine[1:], theirs[1:], strict=True):
+                        np.testing.assert_array_equal(a[rows[0]], b[rows[1]])
+                    compared += rows[0].sum()
+        assert compared >= 5
+
+
 def test_looking_down_moves_the_picture_up() -> None:
     # At a depression of 30 degrees, straight ahead: in the middle of the lowered view.
     depth = 1.0
@@ -86,7 +140,13 @@ def wall(kind: str, z: float, **shape: float) -> SceneObject:
 
 def test_what_hides_and_what_does_not() -> None:
     apple = toy.thing("Apple", (0.0, toy.CAMERA, 1.2))
-    for kind, hides in (("Sofa", True), ("Fridge", True), ("Curtains", False), ("Chair", False)):
+    for kind, hides in (
+        ("Sofa", True),
+        ("Wall", True),
+        ("Fridge", True),
+        ("Curtains", False),
+        ("Chair", False),
+    ):
         found = seen(toy.room(toy.line(1), apple, wall(kind, 0.6)), 0, 0)
         assert ("Apple" in found) != hides, kind
         assert kind in found

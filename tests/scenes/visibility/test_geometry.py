@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes.visibility import geometry
 from tests.support import toy
 
@@ -53,6 +54,22 @@ def test_transitions_by_hand() -> None:
     assert table[state(1, 3, 1), DOWN] == state(1, 3, 1)
     assert table[state(1, 3, 1), UP] == state(1, 3, 0)
     assert table[state(1, 3, 0), UP] == state(1, 3, 0)
+
+
+def test_steps_of_another_grid() -> None:
+    grid = PoseGrid(grid_size=0.5, rotations=12, horizons=(-30, 0, 30))
+    spots = toy.points(*((x * 0.5, z * 0.5) for x in range(3) for z in range(3)))
+    ends = spots[geometry.next_positions(spots, grid)[4]][:, [0, 2]] / 0.5 - (1, 1)
+    assert ends[:4].tolist() == [[0, 1], [1, 1], [1, 1], [1, 0]]  # 0, 30, 60 and 90 degrees
+    table = geometry.transitions(geometry.next_positions(spots, grid), grid)
+    here, turned = grid.from_degrees(4, 60, -30), grid.from_degrees(4, 90, -30)
+    diagonal, level = grid.from_degrees(8, 60, -30), grid.from_degrees(4, 60, 0)
+    back = grid.from_degrees(4, 30, -30)
+    assert table[here].tolist() == [diagonal, back, turned, here, level]
+    assert table[level, [UP, DOWN]].tolist() == [here, grid.from_degrees(4, 60, 30)]
+    one = PoseGrid(horizons=(0,))
+    table = geometry.transitions(geometry.next_positions(toy.line(2), one), one)
+    assert (table[:, [UP, DOWN]] == np.arange(16)[:, None]).all()
 
 
 def test_distances_by_hand() -> None:
