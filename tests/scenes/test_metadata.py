@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tdanet_jax.scenes.labels import Labels
 
 from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneError, metadata
+from tdanet_jax.scenes.room_names import Kinds
 
 BOX = {"center": {"x": 0.0, "y": 1.5, "z": 1.0}, "size": {"x": 0.2, "y": 0.2, "z": 0.2}}
 DOCUMENT: dict[str, Any] = {
@@ -214,7 +214,7 @@ places = st.sampled_from(
 def test_whatever_is_wrong_is_a_scene_error(path: list[Any], value: Any) -> None:
     message = ""
     try:
-        metadata._read_scene(Path("scenes.json"), broken(path, value), Labels())
+        metadata._read_scene(Path("scenes.json"), broken(path, value), Kinds())
     except SceneError as error:
         message = str(error)
     assert "\n" not in message
