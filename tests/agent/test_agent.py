@@ -274,8 +274,9 @@ def test_a_network_of_ithors_rooms_goes_to_rooms_on_another_grid(some_rooms, glo
     network = dataclasses.replace(TINY.network, odometry=True, triangulation=True)
     run, data = tmp_path / "run", tmp_path / "rooms.npz"
     save_untrained(dataclasses.replace(TINY, network=network), run, some_rooms, glove)
-    corridor = dataclasses.replace(toy.corridor(), grid=grid)
-    scenes = [dataclasses.replace(corridor, name=name, room_type="hall") for name in "AB"]
+    apple = toy.thing("Apple", (0.0, toy.CAMERA, 1.8))  # near enough for there to be no void
+    hall = dataclasses.replace(toy.room(toy.line(5), apple), room_type="hall", grid=grid)
+    scenes = [dataclasses.replace(hall, name=name) for name in "AB"]
     rooms = Rooms(tabulation.build(scenes), Extras(parts={"A": "train", "B": "test"}))
     dataset.save_rooms(rooms, data)
     results = tdanet_jax.evaluate(run, data=str(data), policy="greedy", out=tmp_path / "out")
