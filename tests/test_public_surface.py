@@ -84,11 +84,18 @@ class Stopper(Callbacks):
 @pytest.mark.usefixtures("ithor")
 def test_a_run_from_python_is_stopped(tmp_path: Path) -> None:
     folder, stopper = tmp_path / "run", Stopper(2)
-    assert tdanet_jax.train(TINY, folder, callbacks=stopper) is None
-    assert stopper.notes[0] == f"tdanet, split 18/4, seed 0 -> {folder}"
-    assert [row["steps"] for row in read_metrics(folder)] == [40, 80]
+    # What tests/system/test_faults.py trains, so that it is compiled once.
+    config = TrainConfig(
+        split="14/8",
+        steps=1200,
+        learner=LearnerConfig(num_envs=8, rollout_steps=5),
+        network=NetworkConfig(width=16, hidden=16),
+    )
+    assert tdanet_jax.train(config, folder, callbacks=stopper) is None
+    assert stopper.notes[0] == f"tdanet, split 14/8, seed 0 -> {folder}"
+    assert [row["steps"] for row in read_metrics(folder)] == [400, 800]
     with pytest.raises(ValueError, match="exists and is not empty"):
-        tdanet_jax.train(TINY, folder)
+        tdanet_jax.train(config, folder)
     with pytest.raises(ValueError, match="needs a configuration"):
         tdanet_jax.train(None, tmp_path / "other")
     with pytest.raises(ValueError, match="sampled or greedy"):
