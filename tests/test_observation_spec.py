@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -139,11 +138,3 @@ def test_a_run_with_a_custom_sensor_is_read_only_by_those_who_trust_it(
     for name in config.network.sensors:
         monkeypatch.setitem(sys.modules, name, sys)
     assert configs.load(path) == config
-
-
-def test_a_configuration_is_checked_without_jax() -> None:
-    program = (
-        "import sys; from tdanet_jax.config import BEST; BEST.check(); "
-        "assert 'jax' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True)

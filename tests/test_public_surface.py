@@ -44,7 +44,9 @@ def test_the_import_is_light() -> None:
 
 
 def test_a_configuration_needs_no_jax() -> None:
-    assert "jax" not in loaded("from tdanet_jax import TrainConfig; TrainConfig().check()")
+    assert "jax" not in loaded(
+        "from tdanet_jax.config import BEST, TrainConfig; TrainConfig().check(); BEST.check()"
+    )
 
 
 @pytest.mark.parametrize("more", ["", "import tdanet_jax.agent.ai2thor"])
@@ -79,16 +81,32 @@ class Stopper(Callbacks):
         return self.left == 0
 
 
-@pytest.mark.usefixtures("ithor", "few_episodes")
-def test_a_run_from_python_is_stopped_resumed_and_evaluated(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("ithor")
+def test_a_run_from_python_is_stopped(tmp_path: Path) -> None:
     folder, stopper = tmp_path / "run", Stopper(2)
-    assert tdanet_jax.train(TINY, folder, callbacks=stopper) is None
-    assert stopper.notes[0] == f"tdanet, split 18/4, seed 0 -> {folder}"
-    assert [row["steps"] for row in read_metrics(folder)] == [40, 80]
+    # What tests/system/test_faults.py trains, so that it is compiled once.
+    config = TrainConfig(
+        split="14/8",
+        steps=1200,
+        learner=LearnerConfig(num_envs=8, rollout_steps=5),
+        network=NetworkConfig(width=16, hidden=16),
+    )
+    assert tdanet_jax.train(config, folder, callbacks=stopper) is None
+    assert stopper.notes[0] == f"tdanet, split 14/8, seed 0 -> {folder}"
+    assert [row["steps"] for row in read_metrics(folder)] == [400, 800]
     with pytest.raises(ValueError, match="exists and is not empty"):
-        tdanet_jax.train(TINY, folder)
+        tdanet_jax.train(config, folder)
     with pytest.raises(ValueError, match="needs a configuration"):
         tdanet_jax.train(None, tmp_path / "other")
+    with pytest.raises(ValueError, match="sampled or greedy"):
+        tdanet_jax.evaluate(folder, "random")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ithor", "few_episodes")
+def test_a_run_from_python_is_stopped_resumed_and_evaluated(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    assert tdanet_jax.train(TINY, folder, callbacks=Stopper(2)) is None
     results = tdanet_jax.train(None, folder, resume=True)
     assert results is not None
     assert (results["steps"], results["seen"]["L>=1"]["n"]) == (120, 100)
@@ -99,8 +117,6 @@ def test_a_run_from_python_is_stopped_resumed_and_evaluated(tmp_path: Path) -> N
 
     several = tdanet_jax.evaluate([folder], "greedy")
     assert [one["policy"] for one in several] == ["greedy"]
-    with pytest.raises(ValueError, match="sampled or greedy"):
-        tdanet_jax.evaluate(folder, "random")
 
 
 @pytest.mark.usefixtures("ithor", "few_episodes")
@@ -108,7 +124,8 @@ def test_policies_without_a_checkpoint(tmp_path: Path) -> None:
     best = tdanet_jax.evaluate(policy="shortest_path", out=tmp_path / "best")
     assert best["unseen"]["L>=1"]["SPL"] == 100
     assert (tmp_path / "best" / "results.md").exists()
-    seeds = [tdanet_jax.evaluate(policy=policies.random(), seed=seed) for seed in (0, 0, 1)]
+    random = policies.random()
+    seeds = [tdanet_jax.evaluate(policy=random, seed=seed) for seed in (0, 0, 1)]
     assert seeds[0]["policy"] == seeds[0]["model"] == "custom"
     assert seeds[0] == seeds[1] != seeds[2]
     with pytest.raises(ValueError, match="policy greedy: needs a checkpoint"):

@@ -90,21 +90,24 @@ def detections_of(tables, pose):
     return [Detection(name, *map(float, box)) for name, box in zip(names, boxes, strict=True)]
 
 
+observe = jax.jit(jax.vmap(dynamics.observe, (0, None)))
+transition = jax.jit(jax.vmap(dynamics.transition, (0, 0, None)))
+start = jax.jit(jax.vmap(dynamics.start, (0, 0, None)))
+forward = jax.jit(actor_critic.forward, static_argnums=0)
+
+
 def decide_alike(agent, some_rooms, glove, rotation=0, steps=3):
     """The agent and its network in the environment, side by side; how often it was stopped."""
     parents = find_parents(some_rooms, TARGETS)
     params = make_params(some_rooms, TARGETS, parents, TEST_STEP_LIMITS, agent.model.spec)
     model, weights = agent.model, agent.weights
     table = actor_critic.prepare(model, weights, jnp.asarray(glove.table(some_rooms.classes)))
-    observe = jax.jit(jax.vmap(dynamics.observe, (0, None)))
-    transition = jax.jit(jax.vmap(dynamics.transition, (0, 0, None)))
-    forward = jax.jit(actor_critic.forward, static_argnums=0)
     # It begins where it cannot move ahead.
     ahead = some_rooms.next_position[:, rotation // 45]
     position = int(np.flatnonzero(ahead == np.arange(len(ahead)))[9])
     goal = some_rooms.targets.index("Mug")
     one = jnp.array([position * 16 + rotation // 45 * 2]), jnp.array([goal])
-    state = jax.vmap(dynamics.start, (0, 0, None))(*one, params)
+    state = start(*one, params)
     carry, probs, is_first = model.initial_carry(1, weights), jnp.zeros((1, 6)), jnp.zeros(1, bool)
     own, blocked, stopped = agent.start(rotation), False, 0
     for key in jax.random.split(jax.random.key(3), steps):

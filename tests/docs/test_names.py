@@ -20,7 +20,7 @@ COMMANDS = (
     "train_zero_shot", "trajectories",
 )  # fmt: skip
 #: Flags of other programs that the pages mention.
-FOREIGN = {"--check", "--fix", "--xla_gpu_deterministic_ops", "--help"}
+FOREIGN = {"--check", "--durations", "--fix", "--help", "--xla_gpu_deterministic_ops"}
 #: Where the files are that a page may name.
 FOLDERS = (
     "tests/", "tdanet_jax/", "experiments/", "docs/", "assets/", "agents/18", "notebooks/", ".ci/"

@@ -37,6 +37,7 @@ def run(line: str, *more: str) -> None:
     importlib.import_module(module).main([*given, *more])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ithor", "few_episodes")
 def test_the_example_on_the_page_is_a_sensor(
     lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -15,6 +15,9 @@ import tdanet_jax
 from tdanet_jax.config import TrainConfig
 from tests.support.pages import PAGES, ROOT, Block, blocks
 
+#: Pages whose blocks take long: by hand.
+SLOW = ("docs/analysis.md",)
+
 
 def runs(one: Block) -> bool:
     return one.language == "python" and not one.note
@@ -41,7 +44,14 @@ def small_runs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("few_episodes", "small_runs")
-@pytest.mark.parametrize("page", [page for page in PAGES if any(map(runs, blocks(page)))])
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[pytest.mark.slow] if page in SLOW else [])
+        for page in PAGES
+        if any(map(runs, blocks(page)))
+    ],
+)
 def test_the_blocks_of_a_page_run(
     page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -173,12 +173,12 @@ def assert_worlds_agree(world: World, params: EnvParams, batch: int, steps: int,
     return successes
 
 
-def test_agrees_with_the_slow_world_on_10000_steps_in_real_rooms(some_rooms: SceneTables) -> None:
+def test_agrees_with_the_slow_world_in_real_rooms(some_rooms: SceneTables) -> None:
     parents, named = random_parents(some_rooms, seed=1)
     world = World(some_rooms, named, STEP_LIMITS, oracle.walk_on_grid(some_rooms))
     params = make_params(some_rooms, TARGETS, parents, STEP_LIMITS, ObservationSpec())
-    successes = assert_worlds_agree(world, params, batch=100, steps=100, seed=2)
-    assert successes > 100, "the walk should reach targets, or little has been compared"
+    successes = assert_worlds_agree(world, params, batch=40, steps=50, seed=2)
+    assert successes > 50, "the walk should reach targets, or little has been compared"
 
 
 def test_agrees_with_the_slow_world_in_rooms_built_from_boxes() -> None:
@@ -216,7 +216,7 @@ def test_rewards_for_likeness_agree_with_the_slow_world(some_rooms: SceneTables)
     assert assert_worlds_agree(world, params, batch=25, steps=30, seed=6) > 20
 
 
-@settings(max_examples=3)
+@settings(max_examples=2)
 @given(random_tables(), st.integers(0, 1000))
 def test_rewards_for_likeness_agree_on_random_tables(tables: SceneTables, seed: int) -> None:
     similarity, named = random_likeness(tables, seed)
@@ -235,7 +235,7 @@ def check_random_tables(tables: SceneTables, seed: int) -> None:
     assert_worlds_agree(world, params, batch=8, steps=20, seed=seed)
 
 
-@settings(max_examples=12)
+@settings(max_examples=4)  # each compiles; many more in the slow test below
 @given(random_tables(), st.integers(0, 1000))
 def test_agrees_with_the_slow_world_on_random_tables(tables: SceneTables, seed: int) -> None:
     check_random_tables(tables, seed)
@@ -265,7 +265,7 @@ def test_observations_of_real_rooms_are_the_slow_worlds(some_rooms: SceneTables,
     check_observations(some_rooms, rows, states.astype(np.int32))
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(random_tables(), st.sampled_from(["object", "class"]))
 def test_observations_of_random_tables_are_the_slow_worlds(tables: SceneTables, rows: str) -> None:
     check_observations(tables, rows, np.arange(tables.num_states, dtype=np.int32))

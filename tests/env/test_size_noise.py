@@ -23,9 +23,9 @@ from tests.support.oracle import ROOMS
 BATCH, STEPS, NOISE = 128, 40, 0.5
 
 
-def params_of(tables: SceneTables, noise: float, sensors: bool = False) -> EnvParams:
+def params_of(tables: SceneTables, noise: float) -> EnvParams:
     targets = dict.fromkeys(ROOMS, tables.targets)
-    spec = ObservationSpec(sensors=("odometry", "triangulation") if sensors else ())
+    spec = ObservationSpec(sensors=("odometry", "triangulation"))
     return make_params(tables, targets, no_parents(tables), (7,) * 4, spec, size_noise=noise)
 
 
@@ -54,7 +54,8 @@ def pairs(some_rooms: SceneTables) -> tuple:
 def test_the_targets_boxes_alone_grow_and_by_one_factor_an_episode(pairs: tuple) -> None:
     (plain, truth), (state, obs) = pairs
     np.testing.assert_array_equal(state.pose, plain.pose)
-    chex.assert_trees_all_equal(obs.replace(boxes=truth.boxes), truth)
+    same = obs.replace(boxes=truth.boxes, sensors=truth.sensors)
+    chex.assert_trees_all_equal(same, truth)
     is_target = truth.mask & (truth.classes == truth.target[..., None])
     assert is_target.any(-1).sum() > 200
     factor = np.where(is_target, state.area_factor[..., None], 1)
@@ -74,13 +75,12 @@ def test_a_factor_lasts_for_an_episode_and_is_spread_over_its_range(pairs: tuple
     np.testing.assert_allclose([low, high], [-0.8 * NOISE, 0.8 * NOISE], atol=0.05)
 
 
-def test_what_is_sensed_of_the_target_is_that_of_its_changed_boxes(some_rooms: SceneTables) -> None:
-    (_, truth), (state, obs) = (
-        played(params_of(some_rooms, noise, True)) for noise in (0.0, NOISE)
-    )
+def test_what_is_sensed_of_the_target_is_that_of_its_changed_boxes(pairs: tuple) -> None:
+    (_, truth), (state, obs) = pairs
     there, seen = (np.asarray(found.sensors["triangulation"]) for found in (truth, obs))
     place, radius = slice(0, 3), 3
-    np.testing.assert_array_equal(seen[..., place], there[..., place])
+    # Two programs: float32 sums in another order.
+    np.testing.assert_allclose(seen[..., place], there[..., place], rtol=1e-3, atol=2e-5)
     whole = (there[..., radius] < 0.6) & (seen[..., radius] < 0.6) & (there[..., radius] > 0)
     ratio = seen[..., radius][whole] / there[..., radius][whole]
     np.testing.assert_allclose(ratio, np.sqrt(np.asarray(state.area_factor))[whole], rtol=1e-4)

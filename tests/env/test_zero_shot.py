@@ -170,8 +170,15 @@ def training_walk(params: EnvParams) -> tuple[Any, ...]:
     return jax.lax.scan(body, state, jax.random.split(jax.random.key(1), 60))[1]
 
 
-@pytest.mark.parametrize("split", SPLITS, ids=NAMES)
-@pytest.mark.parametrize(("rows", "sensors"), [("class", False), ("object", True)])
+@pytest.mark.parametrize(
+    ("split", "rows", "sensors"),
+    [
+        *((split, "class", False) for split in SPLITS),
+        (SPLITS[0], "object", True),
+        *(pytest.param(split, "object", True, marks=pytest.mark.slow) for split in SPLITS[1:]),
+    ],
+    ids=[f"{name}-{rows}" for rows in ("class", "object") for name in NAMES],
+)
 def test_perturbing_all_hidden_data_changes_nothing_that_training_reads(
     rooms: SceneTables, glove: WordVectors, split: tuple[str, bool], rows: str, sensors: bool
 ) -> None:
@@ -190,7 +197,12 @@ def test_perturbing_all_hidden_data_changes_nothing_that_training_reads(
 
 
 @pytest.mark.parametrize(
-    ("model", "paid"), [("tdanet", "parents"), ("ssnet", "similarity"), ("mjolnir-o", "parents")]
+    ("model", "paid"),
+    [
+        ("tdanet", "parents"),
+        ("ssnet", "similarity"),
+        pytest.param("mjolnir-o", "parents", marks=pytest.mark.slow),
+    ],
 )
 def test_perturbing_all_hidden_data_changes_no_parameter(
     rooms: SceneTables, glove: WordVectors, model: str, paid: Any
@@ -201,12 +213,13 @@ def test_perturbing_all_hidden_data_changes_no_parameter(
     hidden = make_split("18/4").hidden
     noisy = perturbed(rooms, hidden, seed=2)
     network = make_task(config, rooms, glove).model
+    begin = jax.jit(learner.init, static_argnums=(1, 2))
     chunk = learner.make_train(config.learner, network, 2)
     states = []
     for tables, vectors in ((rooms, glove), (noisy, other_words(glove, hidden, rooms.classes))):
         task = make_task(config, tables, vectors)
         assert task.model == network
-        start = learner.init(
+        start = begin(
             jax.random.key(3), config.learner, network, task.train_words, task.train_params
         )
         chunked = chunk(start, jnp.array([0.0, 0.1]), task.train_words, task.train_params)

@@ -48,6 +48,7 @@ def test_a_wrong_folder_ends_before_anything_is_measured(tmp_path, capsys):
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_a_model_that_multiplies_in_float32_alone_is_measured_once(ithor, tmp_path):
     out = tmp_path / "figures.jsonl"
     arguments = ["--parts", "rollout", "--models", "savn", "--batches", "2", "--repeats", "1"]
@@ -56,6 +57,7 @@ def test_a_model_that_multiplies_in_float32_alone_is_measured_once(ithor, tmp_pa
     assert [(row["model"], row["precision"]) for row in rows] == [("savn", "float32")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "flags"), [("ssnet", ["--odometry"]), ("tdanet", ["--odometry", "--triangulation"])]
 )
@@ -94,6 +96,7 @@ def test_the_hand_formula_counts_the_kernels_that_a_step_uses(senses):
     assert benchmarking.tdanet_forward_macs(model, 50) == kernels
 
 
+@pytest.mark.slow
 def test_an_evaluation_plays_the_networks_of_a_run_in_one_call(ithor, tmp_path):
     out = tmp_path / "figures.jsonl"
     flags = ["--networks", "2", "--checkpoint", str(OLD_RUN), "--repeats", "1", "--out", str(out)]

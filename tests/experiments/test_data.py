@@ -42,8 +42,14 @@ def fails(command, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> 
     return message
 
 
+@pytest.mark.parametrize(
+    "trained", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["evaluated", "trained"]
+)
 def test_the_miniature_trains_and_evaluates(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    trained: bool,
 ) -> None:
     """Old-style links, names of AI2-THOR 1.0, published parents, graph and episodes."""
     monkeypatch.chdir(tmp_path)
@@ -69,6 +75,8 @@ def test_the_miniature_trains_and_evaluates(
         file.write("\ntop 1 0 0 0 0 0 0\n")
     evaluate.main(shortest)
     assert json.loads(Path("shortest/results.json").read_text())["seen"]["L>=1"]["SR"] == 100
+    if not trained:
+        return
     train_zero_shot.main([*rooms, *run])
     results = json.loads(Path("run/results.json").read_text())
     assert results["data_version"] == dataset.load_rooms(Path("rooms.npz")).tables.data_version

@@ -117,7 +117,7 @@ def test_two_runs_are_compared_episode_by_episode(
     assert f"| seed1 minus {opinionated_run.name} |" in page
 
 
-def test_one_run_gives_the_files_of_a_single_result_beside_it(ithor, tmp_path):
+def test_one_run_gives_the_files_of_a_single_result_beside_it(ithor, few_episodes, tmp_path):
     run = shutil.copytree(OLD_RUN, tmp_path / "run")
     evaluate.main(["--checkpoint", str(run), "--policy", "greedy", "--seed", "5"])
     assert {path.name for path in (run / "greedy").iterdir()} == {

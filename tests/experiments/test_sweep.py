@@ -13,9 +13,11 @@ import time
 import pytest
 
 from experiments import evaluate, sweep
+from tdanet_jax.evaluation.sweep_report import Cost
 from tdanet_jax.io import files
 from tests.evaluation.test_comparison import result
 from tests.evaluation.test_sweep import BASE, made
+from tests.support import command
 
 COMMAND = [sys.executable, "-m", "experiments.sweep"]
 TINY = [
@@ -61,6 +63,26 @@ def test_wrong_arguments_give_one_line_and_write_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("ithor", "few_episodes")
+def test_a_small_sweep_trains_evaluates_the_history_and_reports(tmp_path, monkeypatch, capsys):
+    """What it compares with, and times, are made up here."""
+    others = [result(model=name) for name in ("random", "shortest_path")]
+    cost = {"tdanet": Cost("tdanet", 1000, {1: 0.5, 1024: 2.0})}
+    monkeypatch.setattr(sweep.sweep, "untrained", lambda runs, seed: others)
+    monkeypatch.setattr(sweep, "costs", lambda runs: cost)
+    out = tmp_path / "sweep"
+    arguments = ["--splits", "14/8", "--seeds", "3", "--steps", "800", "--history", "2"]
+    sweep.main([*arguments, *command.TINY, "--out", str(out)])
+    run = out / "14-8-tdanet-seed3"
+    assert {path.name for path in run.iterdir()} == RUN_FILES
+    report = json.loads((out / "report.json").read_text())
+    trained = report["comparison"]["14/8"]["tdanet"]["seen"]["L>=1"]["SR"]["mean"]
+    assert trained == json.loads((run / "results.json").read_text())["seen"]["L>=1"]["SR"]
+    assert len(report["learning_curves"]["14/8"]["tdanet"]["episodes"]) == 2
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.slow
 def test_a_sweep_trains_evaluates_the_history_and_reports(ithor, few_episodes, tmp_path, capsys):
     out = tmp_path / "sweep"
     (out / "random").mkdir(parents=True)
@@ -106,8 +128,9 @@ def test_what_cannot_stand_in_one_report_shows_before_anything_is_trained(tmp_pa
     assert [path.name for path in out.iterdir()] == ["18-4-tdanet-seed1"]
 
 
-def test_a_report_waits_for_one_in_another_process(tmp_path, capsys):
-    order = []
+def test_a_report_waits_for_one_in_another_process(tmp_path, monkeypatch):
+    order, said, waiting = [], [], threading.Event()
+    monkeypatch.setattr(sweep.console, "print", lambda text: (said.append(text), waiting.set()))
 
     def report():
         with sweep.alone(tmp_path):
@@ -116,11 +139,11 @@ def test_a_report_waits_for_one_in_another_process(tmp_path, capsys):
     with files.locked(tmp_path):
         second = threading.Thread(target=report)
         second.start()
-        second.join(timeout=0.3)
+        assert waiting.wait(timeout=120)
         order.append("first")
-    second.join(timeout=10)
+    second.join(timeout=120)
     assert order == ["first", "second"]
-    assert "another process reports; waiting for it" in capsys.readouterr().out
+    assert "another process reports; waiting for it" in said[0]
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import pytest
 import tdanet_jax
 from experiments import evaluate, train_zero_shot
 from tdanet_jax.io import files
+from tdanet_jax.training import train as training
 from tests.support import command
 
 WRITTEN = {
@@ -28,6 +29,7 @@ def wait_for(found, seconds=120):
         time.sleep(0.002)
 
 
+@pytest.mark.slow
 def test_it_trains_evaluates_and_goes_on_after_kill_and_term(ithor, tmp_path, capsys):
     """Killed inside a checkpoint, stopped by SIGTERM: --resume ends where it would have anyway."""
     out = tmp_path / "run"
@@ -68,14 +70,23 @@ def test_it_trains_evaluates_and_goes_on_after_kill_and_term(ithor, tmp_path, ca
 
 
 def test_a_split_of_ones_own_is_trained_evaluated_and_gone_on_with(
-    ithor, few_episodes, tmp_path, monkeypatch
+    ithor, few_episodes, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
     arguments = ["--split", "towel,mug,CD", "--steps", "400", "--precision", "float32"]
-    train_zero_shot.main([*arguments, *command.TINY])
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "_report", lambda *_: None)  # to save time
+        train_zero_shot.main([*arguments, *command.TINY])
     [run] = (tmp_path / "runs").iterdir()
     assert re.fullmatch(r"Mug-CD-Towel-tdanet-seed0-\d{8}-\d{6}", run.name)
+    left = run / "checkpoints" / f"{files.PARTIAL}{2**22 + 1}-20"  # of no process
+    left.mkdir()
+    with files.locked(run), pytest.raises(SystemExit):
+        train_zero_shot.main(["--resume", str(run)])
+    assert f"error: {run}: in use by another process\n" == capsys.readouterr().err
     train_zero_shot.main(["--resume", str(run), "--steps", "600"])
+    assert f"removed {left}: half-written when the run was stopped" in capsys.readouterr().out
+    assert {p.name for p in run.iterdir()} == WRITTEN | {files.LOCK_FILE}
     results = json.loads((run / "results.json").read_text())
     assert (results["split"], results["steps"]) == ("Mug,CD,Towel", 800)
     # No room type without an unseen class has unseen episodes.
@@ -97,6 +108,7 @@ def test_a_split_of_ones_own_is_trained_evaluated_and_gone_on_with(
 SENSES = ("--odometry", "--triangulation")
 
 
+@pytest.mark.slow
 def test_two_processes_train_together_and_one_goes_on_alone(ithor, tmp_path):
     """The environments of one run in two processes; one process continues from what they saved.
 

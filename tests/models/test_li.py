@@ -75,6 +75,7 @@ def test_before_the_first_inner_step_it_is_the_published_network() -> None:
     np.testing.assert_allclose(out.value, value, **CLOSE)
 
 
+@pytest.mark.slow
 def test_inner_steps_are_those_of_plain_per_environment_parameters() -> None:
     given = jax.tree.map(lambda x: x[: INTERVAL + 1], inputs())
     out = play(MODEL, parameters(), given)

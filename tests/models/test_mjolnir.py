@@ -87,7 +87,7 @@ def test_the_gradient_is_that_of_the_published_equations(from_cache: bool) -> No
                 ACTIVATIONS
             ]
 
-        cache = jax.vmap(act)(obs)
+        cache = jax.jit(jax.vmap(act))(obs)
 
     def fast(params: Any) -> jax.Array:
         return (features(params, obs, WORDS, cache) * mix).sum()

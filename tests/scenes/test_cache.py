@@ -8,6 +8,7 @@ import sys
 import time
 import warnings
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import pytest
@@ -16,15 +17,15 @@ from tdanet_jax.io import files
 from tdanet_jax.scenes import cache, ithor, tabulation
 from tests.support import toy
 
-# Builds (slowly enough to overlap) and prints the tables' version.
+# Builds, once a line has come, and prints the tables' version.
 BUILDER = """
-import time
+import sys
 import numpy as np
 from tdanet_jax.scenes import cache, ithor
 from tests.support import toy
 def rooms():
     print("building", flush=True)
-    time.sleep(2.0)
+    sys.stdin.readline()
     return [toy.random_room(np.random.default_rng(0))]
 ithor.load_scenes = rooms
 print(cache.load_tables().data_version)
@@ -93,12 +94,24 @@ def start_building(folder: Path) -> subprocess.Popen[str]:
     environment = {**os.environ, cache.VARIABLE: str(folder), "PYTHONPATH": os.getcwd()}
     command = [sys.executable, "-c", BUILDER]
     pipe = subprocess.PIPE
-    return subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True)
+    return subprocess.Popen(
+        command, env=environment, stdin=pipe, stdout=pipe, stderr=pipe, text=True
+    )
+
+
+def first_line(pipe: IO[str] | None) -> str:
+    assert pipe is not None
+    return pipe.readline()
 
 
 def test_one_of_several_processes_builds_and_the_others_wait(tmp_path: Path) -> None:
-    running = [start_building(tmp_path) for _ in range(3)]
-    said = [process.communicate(timeout=120) for process in running]
+    first = start_building(tmp_path)
+    began = first_line(first.stdout)
+    running = [first, start_building(tmp_path), start_building(tmp_path)]
+    told = ["", *(first_line(process.stderr) for process in running[1:])]  # now they wait
+    rest = [process.communicate("go\n") for process in running]
+    said = [(out, line + err) for (out, err), line in zip(rest, told, strict=True)]
+    said[0] = (began + said[0][0], said[0][1])
     assert [process.returncode for process in running] == [0, 0, 0]
     assert sum("building" in out for out, _ in said) == 1
     assert len({out.splitlines()[-1] for out, _ in said}) == 1  # the tables' version
@@ -115,7 +128,7 @@ def test_a_killed_builder_leaves_no_lock_and_no_partial_file(tmp_path: Path) -> 
     killed.kill()
     killed.communicate()
     (tmp_path / f"{files.PARTIAL}{killed.pid}-tables.npz").write_text("half")
-    out, _ = start_building(tmp_path).communicate(timeout=120)
+    out, _ = start_building(tmp_path).communicate("go\n")
     assert out.startswith("building\n")
     assert len(files_of(tmp_path)) == 2
 

@@ -194,7 +194,7 @@ def task_with(some_rooms: SceneTables, glove: WordVectors, *names: str, odometry
     return config, make_task(config, some_rooms, glove)
 
 
-@pytest.mark.slow  # docs/sensors.md's compass is trained with in the fast tier
+@pytest.mark.slow
 def test_a_custom_sensor_is_trained_with(some_rooms: SceneTables, glove: WordVectors) -> None:
     config, task = task_with(some_rooms, glove, step_counter.NAME, odometry=True)
     assert task.spec.sensors == ("odometry", step_counter.NAME)

@@ -1,7 +1,7 @@
 """A run that is killed again and again ends as one that nobody touched.
 
-Slow: `pytest -m slow tests/system/test_kills.py`, about ten minutes. The fast sample is in
-test_train_zero_shot.py.
+Slow: `pytest -m slow tests/system/test_kills.py`, about ten minutes. A run that is stopped
+and resumed among the default tests is in tests/training/test_run.py.
 """
 
 from __future__ import annotations

@@ -288,6 +288,8 @@ FAULTS = (
           "    if a.ndim <= 2 or jax.default_backend()", "training/test_devices.py"),
     Fault("all seeds become the first", "training/run.py", "lambda x, i=i: x[i]", "lambda x, i=i: x[0]",
           "training/test_run.py"),
+    Fault("an old name is not known any more", "training/renames.py", 'r"^held$"', 'r"^helm$"',
+          "training/test_old_runs.py"),
     Fault("an agent that was passed on is trained over", "training/checkpoint.py",
           "return (run / history.NETWORK).exists()", "return False", "evaluation/test_saved_networks.py"),
     Fault("a stranger's model is imported", "config.py", '{"model": (config.model,), ', "{",

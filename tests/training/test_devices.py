@@ -84,7 +84,12 @@ def test_a_process_on_its_own_agrees_with_itself():
 
 @pytest.mark.parametrize(
     ("model", "preset"),
-    [("tdanet", "default"), ("tdanet", "best"), ("mjolnir-r", "default"), ("savn", "default")],
+    [
+        pytest.param("tdanet", "default", marks=pytest.mark.slow),  # best: the same and more
+        ("tdanet", "best"),
+        ("mjolnir-r", "default"),
+        pytest.param("savn", "default", marks=pytest.mark.slow),
+    ],
 )
 def test_an_update_can_be_lowered_for_a_gpu(some_rooms, glove, model, preset, monkeypatch):
     # Not what it computes there, which needs one: that no part of it exists on CPUs alone.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from tdanet_jax.training.gae import advantages
 from tests.support.oracle import Step, generalised_advantages
 
 ENDS = ("done", "time-out", "rollout")
+LONGEST = 4 * (5 + 1)  # of `rollouts`: four pieces of five steps, each with a step that only values
+compiled = jax.jit(advantages)
 numbers = st.floats(-5, 5, allow_nan=False, width=32)
 
 
@@ -65,7 +68,7 @@ def computed(columns: dict[str, list], last_value: float, gamma: float, lam: flo
         return jnp.asarray(np.array(columns[name], dtype)[:, None])
 
     return np.asarray(
-        advantages(
+        compiled(
             column("reward", np.float32), column("value", np.float32),
             jnp.array([last_value], jnp.float32), column("terminal", bool),
             column("bootstrap_only", bool), gamma, lam,
@@ -78,7 +81,10 @@ def computed(columns: dict[str, list], last_value: float, gamma: float, lam: flo
 def test_advantages_are_the_defining_sum_per_episode(
     parts: list[Piece], gamma: float, lam: float
 ) -> None:
-    columns = laid_out(parts, gamma, lam)
+    # An episode before the others makes all rollouts equally long: one compilation.
+    before = LONGEST + 1 - len(laid_out(parts, gamma, lam)["reward"])
+    first = Piece((Step(1.0, -2.0),) * before, "done", 0.0)
+    columns = laid_out([first, *parts], gamma, lam)
     # The last value is of the state that the rollout's last step led to.
     last_value = parts[-1].final_value
     found = computed(columns, last_value, gamma, lam)

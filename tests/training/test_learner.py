@@ -10,7 +10,6 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from tdanet_jax.config import LearnerConfig
@@ -107,11 +106,13 @@ def example(
     return before, after, steps, last, advantages_of(steps, last)
 
 
-@jax.jit
-def forward(weights: Any, carry: Carry, *seen: Any) -> tuple[Carry, Output]:
+@functools.partial(jax.jit, static_argnames="model")
+def forward(
+    weights: Any, carry: Carry, *seen: Any, model: ActorCritic = MODEL
+) -> tuple[Carry, Output]:
     """The network without an activation cache."""
-    table = actor_critic.prepare(MODEL, weights, WORDS)
-    return actor_critic.forward(MODEL, weights, table, carry, *seen)
+    table = actor_critic.prepare(model, weights, WORDS)
+    return actor_critic.forward(model, weights, table, carry, *seen)
 
 
 def advantages_of(steps: Rollout, last: jax.Array) -> jax.Array:
@@ -125,7 +126,7 @@ def test_rollouts_follow_the_slow_world_and_value_time_outs_in_one_more_step(
 ) -> None:
     config = dataclasses.replace(CONFIG, rollout_steps=1, bootstrap_truncated=bootstrap)
     world = World(TABLES, WORTH, LIMITS)
-    state = start(3, config)
+    state = start(3)
     episodes = [begun(state, b) for b in range(B)]
     waiting = np.zeros(B, bool)
     seen = {"success": 0, "time-out": 0, "valued": 0}
@@ -322,34 +323,44 @@ def test_bootstrap_only_steps_do_not_count() -> None:
     )
 
 
-def torch_amsgrad(rate: float, epsilon: float) -> optax.GradientTransformation:
-    """torch.optim.Adam(amsgrad=True), line by line as PyTorch's first versions compute it."""
+@dataclasses.dataclass
+class TorchAdam:
+    """torch.optim.Adam in NumPy; with `amsgrad` line by line as in PyTorch's first versions."""
 
-    def init(params: Any) -> Any:
-        return (0, *(jax.tree.map(jnp.zeros_like, params) for _ in range(3)))
+    rate: float
+    epsilon: float
+    amsgrad: bool
+    count: int = 0
+    memory: dict[int, Any] = dataclasses.field(default_factory=dict)  # by a leaf's number
 
-    def step(grads: Any, memory: Any, params: Any = None) -> Any:
-        count, first, second, largest = memory
-        count += 1
-        first = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, first, grads)
-        second = jax.tree.map(lambda v, g: 0.999 * v + 0.001 * g * g, second, grads)
-        largest = jax.tree.map(jnp.maximum, largest, second)
-        size = rate * np.sqrt(1 - 0.999**count) / (1 - 0.9**count)
-        change = jax.tree.map(lambda m, v: -size * m / (jnp.sqrt(v) + epsilon), first, largest)
-        return change, (count, first, second, largest)
+    def step(self, grads: Any) -> Any:
+        """The change of the parameters."""
+        self.count += 1
+        leaves, tree = jax.tree.flatten(jax.device_get(grads))
+        return jax.tree.unflatten(tree, [self._one(i, g) for i, g in enumerate(leaves)])
 
-    return optax.GradientTransformation(init, step)
+    def _one(self, number: int, grad: np.ndarray) -> np.ndarray:
+        zero = np.zeros_like(grad)
+        first, second, largest = self.memory.get(number, (zero, zero, zero))
+        first, second = 0.9 * first + 0.1 * grad, 0.999 * second + 0.001 * grad**2
+        largest = np.maximum(largest, second)
+        self.memory[number] = first, second, largest
+        correction = np.sqrt(1 - 0.999**self.count)
+        size = self.rate * correction / (1 - 0.9**self.count)
+        if self.amsgrad:
+            return -size * first / (np.sqrt(largest) + self.epsilon)
+        return -size * first / (np.sqrt(second) + self.epsilon * correction)
 
 
 def test_amsgrad_forgets_a_large_first_gradient_no_faster_than_torch() -> None:
     config = dataclasses.replace(CONFIG, amsgrad=True, max_grad_norm=1e9)
-    ours, theirs = learner.make_optimizer(config), torch_amsgrad(1.0, config.adam_epsilon)
-    params = jnp.zeros(3)
-    state, memory = ours.init(params), theirs.init(params)
+    ours, theirs = learner.make_optimizer(config), TorchAdam(1.0, config.adam_epsilon, True)
+    params, step = jnp.zeros(3), jax.jit(ours.update)
+    state = ours.init(params)
     for number in range(50):
         grads = jnp.array([1.0, -2.0, 0.5]) * (100.0 if number == 0 else 1.0)
-        change, state = ours.update(grads, state, params)
-        expected, memory = theirs.update(grads, memory, params)
+        change, state = step(grads, state, params)
+        expected = theirs.step(grads)
         np.testing.assert_allclose(-change, expected, rtol=1e-3)
 
 
@@ -361,21 +372,20 @@ def test_an_update_is_one_step_of_clipped_adam_on_the_gradient_of_the_loss(
     state = start(5)
     rate = 9e-4 * (1 - progress)
     entropy = 0.01 + progress * (0.002 - 0.01)
-    reference = optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm),
-        torch_amsgrad(rate, config.adam_epsilon)
-        if amsgrad
-        else optax.adam(rate, eps=config.adam_epsilon),
-    )
-    memory = reference.init(state.params)
+    reference = TorchAdam(rate, config.adam_epsilon, amsgrad)
     state = state.replace(opt_state=learner.make_optimizer(config).init(state.params))
     for number in range(2):
         key = jax.random.fold_in(state.key, number)
         _, steps, last = rollout(state, key, CONFIG, MODEL, WORDS, PARAMS)
         advantage = advantages_of(steps, last)
-        grads = gradient(state, steps._replace(activations=None), advantage, entropy)[1]
-        change, memory = reference.update(grads, memory, state.params)
-        expected = optax.apply_updates(state.params, change)
+        grads = jax.device_get(
+            gradient(state, steps._replace(activations=None), advantage, entropy)[1]
+        )
+        norm = np.sqrt(sum((leaf**2).sum() for leaf in jax.tree.leaves(grads)))
+        assert norm > config.max_grad_norm or number
+        share = min(1.0, config.max_grad_norm / norm)
+        change = reference.step(jax.tree.map(lambda leaf, by=share: by * leaf, grads))
+        expected = jax.tree.map(np.add, jax.device_get(state.params), change)
         state, _ = update(state, jnp.float32(progress), config, MODEL, WORDS, PARAMS)
         assert int(state.updates) == number + 1
         # Adam divides by the gradient's own size: where that is tiny, its rounding shows.
@@ -384,15 +394,14 @@ def test_an_update_is_one_step_of_clipped_adam_on_the_gradient_of_the_loss(
 
 def test_only_large_kernels_are_rounded_while_acting() -> None:
     model = ActorCritic(TDANetEncoder(width=12, dtype=jnp.bfloat16), hidden=8, dtype=jnp.bfloat16)
-    state = begin(jax.random.key(1), CONFIG, model, WORDS, PARAMS)
+    state = start(1)
     state = state.replace(params=randomised(state.params, seed=2))
     _, steps, _ = rollout(state, jax.random.key(3), CONFIG, model, WORDS, PARAMS)
     assert max(x.size for x in jax.tree.leaves(state.params)) < learner.SMALL
     obs = jax.vmap(dynamics.observe, (0, None))(state.env_state, PARAMS)
-    table = actor_critic.prepare(model, state.params, WORDS)
     recurrent = state.recurrent
     seen = (recurrent.carry, obs, recurrent.prev_action_probs, recurrent.is_first)
-    _, out = actor_critic.forward(model, state.params, table, *seen)
+    _, out = forward(state.params, *seen, model=model)
     np.testing.assert_allclose(steps.value[0], out.value, rtol=1e-5)
 
 
@@ -488,7 +497,11 @@ def test_updates_do_not_repeat_their_randomness() -> None:
     assert not np.array_equal(one.env_state.pose, two.env_state.pose)
 
 
-def test_a_chunk_of_updates_equals_single_ones() -> None:
+def test_a_chunk_of_updates_equals_single_ones_and_is_traced_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    chex.clear_trace_counter()
+    monkeypatch.setattr(learner, "update", chex.assert_max_traces(learner.update, n=1))
     chunk = learner.make_train(CONFIG, MODEL, 3)
     whole, metrics = chunk(start(12), jnp.array([0.0, 0.3]), WORDS, PARAMS)
     state = start(12)
@@ -502,17 +515,8 @@ def test_a_chunk_of_updates_equals_single_ones() -> None:
     chex.assert_trees_all_close(data(whole), data(state), rtol=1e-3, atol=1e-5)
     chex.assert_trees_all_equal(whole.env_state, state.env_state)
     assert int(whole.updates) == 3
-
-
-def test_a_chunk_is_traced_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    chex.clear_trace_counter()
-    monkeypatch.setattr(learner, "update", chex.assert_max_traces(learner.update, n=1))
-    chunk = learner.make_train(CONFIG, MODEL, 2)
-    state = start(13)
-    shapes = jax.tree.map(lambda x: (x.shape, x.dtype), data(state))
-    for share in (0.0, 0.5):
-        state, _ = chunk(state, jnp.array([share, share + 0.5]), WORDS, PARAMS)
-    assert jax.tree.map(lambda x: (x.shape, x.dtype), data(state)) == shapes
+    again, _ = chunk(whole, jnp.array([0.5, 1.0]), WORDS, PARAMS)
+    chex.assert_trees_all_equal_shapes_and_dtypes(data(again), data(start(12)))
 
 
 def test_dropout_keeps_its_share_and_is_off_at_zero() -> None:
@@ -523,24 +527,25 @@ def test_dropout_keeps_its_share_and_is_off_at_zero() -> None:
     assert abs(kept.mean() - 0.75) < 0.04
     assert len(np.unique(kept.reshape(-1, kept.shape[-1]), axis=0)) > T * B / 4
     none = ActorCritic(TDANetEncoder(width=12, dropout=0.0), hidden=8)
-    state = begin(jax.random.key(0), CONFIG, none, WORDS, PARAMS)
-    _, steps, _ = rollout(state, jax.random.key(1), CONFIG, none, WORDS, PARAMS)
+    _, steps, _ = jax.eval_shape(
+        lambda state: learner.rollout(state, state.key, CONFIG, none, WORDS, PARAMS), start()
+    )
     assert steps.dropout_mask is None
 
 
 def test_a_small_task_is_learnt() -> None:
     config = LearnerConfig(
-        num_envs=64, rollout_steps=20, learning_rate=3e-3, entropy_weight=0.02,
+        num_envs=32, rollout_steps=20, learning_rate=5e-3, entropy_weight=0.02,
         final_entropy_weight=0.0,
     )  # fmt: skip
     params = PARAMS.replace(step_limit=jnp.full(4, 25, jnp.int32))
     model = ActorCritic(TDANetEncoder(width=32, dropout=0.1), hidden=32)
     state = begin(jax.random.key(14), config, model, WORDS, params)
-    chunk = learner.make_train(config, model, 600)
+    chunk = learner.make_train(config, model, 300)
     _, metrics = chunk(state, jnp.array([0.0, 1.0]), WORDS, params)
     success = np.asarray(metrics["success_sum"]) / np.asarray(metrics["episodes"])
     efficiency = np.asarray(metrics["spl_sum"]) / np.asarray(metrics["episodes"])
     assert success[:10].mean() < 0.3
-    assert success[-50:].mean() > 0.95
-    assert efficiency[-50:].mean() > 3 * efficiency[:10].mean()
+    assert success[-25:].mean() > 0.85
+    assert efficiency[-25:].mean() > 2.5 * efficiency[:10].mean()
     assert int(metrics["episodes"].sum()) > 10_000

@@ -49,6 +49,21 @@ def expected(run: Path) -> dict[str, Any]:
     return content
 
 
+def test_all_its_arrays_are_known_by_the_names_of_today(run: Path, task: Task) -> None:
+    """A run takes every array of the file into its state."""
+    state = Run(run, configs.load(run / CONFIG_FILE), task).state
+    known = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf
+             for path, leaf in jax.tree_util.tree_leaves_with_path(state)}  # fmt: skip
+    found, _ = Checkpoints(run)._read(None)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(found):
+        name = jax.tree_util.keystr(path, simple=True, separator="/")
+        if name != "key":
+            np.testing.assert_array_equal(known[name], leaf, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "run", [NAMES[0], pytest.param(NAMES[1], marks=pytest.mark.slow)], indirect=True
+)
 def test_the_next_update_is_that_of_the_old_code(run: Path, task: Task) -> None:
     there = expected(run)
     again = Run(run, configs.load(run / CONFIG_FILE), task)

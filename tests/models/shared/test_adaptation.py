@@ -163,7 +163,11 @@ def slow_rollout(params: Any, given: Any, first_order: bool = False, **network: 
 NOT_ADAPTED = ("way",)
 
 
-@pytest.mark.parametrize("odometry", [False, True], ids=["plain", "odometry"])
+@pytest.mark.parametrize(
+    "odometry",
+    [pytest.param(False, marks=pytest.mark.slow), True],
+    ids=["plain", "odometry"],
+)
 def test_values_are_those_of_plain_per_environment_parameters(odometry: bool) -> None:
     spec = ObservationSpec(sensors=("odometry",) if odometry else ())
     model, plain = (m.clone(spec=spec) for m in (MODEL, PLAIN))
@@ -297,7 +301,7 @@ def test_the_learned_loss_is_the_published_convolution() -> None:
     found = module.apply({"params": params}, record)
     expected = [learned_loss(params, row) for row in record]
     np.testing.assert_allclose(found, expected, rtol=1e-5)
-    grad = jax.grad(lambda x: module.apply({"params": params}, x).sum())(0 * record)
+    grad = jax.jit(jax.grad(lambda x: module.apply({"params": params}, x).sum()))(0 * record)
     assert np.isfinite(grad).all()
 
 

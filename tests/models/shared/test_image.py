@@ -143,6 +143,7 @@ def test_the_image_and_the_target_matter(part: str) -> None:
     carry, obs, prev_action_probs, is_first, _ = jax.tree.map(lambda x: x[0], inputs())
     carry = MODEL.initial_carry(B, parameters())
 
+    @jax.jit
     def logits(obs: Observation) -> jax.Array:
         class_table = actor_critic.prepare(MODEL, parameters(), WORDS)
         return actor_critic.forward(
