@@ -106,10 +106,10 @@ LABELS = "name,room_type,part\nFloorPlan1-1,kitchen,train\nFloorPlan_Train1_1,ha
 def test_types_and_parts_from_flags_and_a_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The file says most, then the table, iTHOR's names, the flags."""
+    """The file says most, then the table, names that begin with iTHOR's, the flags."""
     monkeypatch.chdir(tmp_path)
     bare = {key: value for key, value in DOCUMENT.items() if key != "room_type"}
-    names = ("FloorPlan1-1", "FloorPlan_Train1_1", "FloorPlan430-5", "FloorPlan401")
+    names = ("FloorPlan1-1", "FloorPlan_Train1_1", "Attic", "FloorPlan401", "FloorPlan430-5")
     documents = [{**bare, "name": name} for name in names]
     documents.append({**DOCUMENT, "name": "Lab", "split": "test"})
     Path("rooms.json").write_text(json.dumps(documents))
@@ -120,12 +120,12 @@ def test_types_and_parts_from_flags_and_a_table(
     tables = rooms.tables
     assert tables.room_types[4:] == ("den", "hall")
     assert [tables.room_types[kind] for kind in tables.room_type] == [
-        "kitchen", "hall", "den", "bathroom", "bedroom"
+        "kitchen", "hall", "den", "bathroom", "bathroom", "bedroom"
     ]  # fmt: skip
     assert rooms.extras is not None
     assert rooms.extras.parts == {
-        "FloorPlan1-1": "train", "FloorPlan_Train1_1": "test", "FloorPlan430-5": "test",
-        "Lab": "test",
+        "FloorPlan1-1": "train", "FloorPlan_Train1_1": "test", "Attic": "test",
+        "FloorPlan430-5": "test", "Lab": "test",
     }  # fmt: skip
 
 
@@ -134,19 +134,19 @@ def test_types_and_parts_from_flags_and_a_table(
     [
         (None, "", "rooms.json: Lab: no room type; give it in the file"),
         (None, "--rooms none.csv", "none.csv: No such file or directory"),
-        (None, "--room-type a/b", "room_type 'a/b': must have no path separator"),
+        (None, "--room-type a/b", "room_type 'a/b': is a path"),
         (None, "--room-type Kitchen", "room_type 'Kitchen': did you mean kitchen?"),
-        ("", "", "rooms.csv: its first line must be name,room_type,part"),
-        ("name,room_type\n", "", "rooms.csv: its first line must be name,room_type,part"),
+        ("", "", "rooms.csv: line 1: the columns are not name, room_type, part"),
+        ("room_type,part\n", "", "rooms.csv: line 1: the columns are not name, room_type, part"),
         ("name,room_type,part\nDen,office,\n", "", "no room is called Den, which --rooms lists"),
-        ("name,room_type,part\nLab,office\n", "", "rooms.csv, line 2: 2 cells, not 3"),
+        ("name,room_type,part\nLab,office\n", "", "rooms.csv: line 2: 2 columns, not 3"),
         (
             "name,room_type,part\nLab,office,half\n",
             "",
-            "rooms.csv, line 2: split 'half', not train",
+            "rooms.csv: line 2: part 'half', not train",
         ),
-        ("name,room_type,part\n,office,test\n", "", "rooms.csv, line 2: no name"),
-        ("name,room_type,part\n" + 2 * "Lab,den,\n", "", "rooms.csv, line 3: Lab is there twice"),
+        ("name,room_type,part\n,office,test\n", "", "rooms.csv: line 2: room name '': empty"),
+        ("name,room_type,part\n" + 2 * "Lab,den,\n", "", "rooms.csv: line 3: Lab is listed twice"),
         ("name,room_type,part\nLab,,test\n", "", "rooms.json: Lab: no room type"),
     ],
 )

@@ -11,9 +11,9 @@ import threading
 import time
 
 import pytest
+from tdanet_jax.evaluation.sweep_report import Cost
 
 from experiments import evaluate, sweep
-from tdanet_jax.evaluation.sweep_report import Cost
 from tdanet_jax.io import files
 from tests.evaluation.test_comparison import result
 from tests.evaluation.test_sweep import BASE, made

@@ -327,7 +327,8 @@ def test_rooms_of_any_name(tmp_path: Path) -> None:
     ]
 
     table = {"Lab [bold]": RoomKind("bedroom", "test"),
-             "FloorPlan30-1": RoomKind("living_room", None), "Nowhere": RoomKind("kitchen", None)}  # fmt: skip
+             "FloorPlan30-1": RoomKind("living_room", None),
+             "Nowhere": RoomKind("kitchen", None)}  # fmt: skip
     kinds = Kinds(table, RoomKind("living_room", "train"))
     back = importer.read_folder(source, lambda share, line: lines.append(line), kinds)
     assert dict(zip(back.tables.scenes, back.tables.room_type.tolist(), strict=True)) == {
