@@ -26,7 +26,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def read(folder: Path) -> SceneData:
-    return reader.read_scene(folder, "FloorPlan1", 0)
+    return reader.read_scene(folder, "FloorPlan1", "kitchen")
 
 
 def change(folder: Path, name: str, edit: Any) -> None:
@@ -236,12 +236,12 @@ def test_boxes_of_another_frame(folder: Path) -> None:
     change(folder, "objects_bb.json", lambda _: wide)
     with pytest.raises(FileError, match=r"frame of 300x300; --frame-size WIDTHxHEIGHT"):
         read(folder)
-    assert rows(reader.read_scene(folder, "FloorPlan1", 0, Frame(600, 450))) == before
+    assert rows(reader.read_scene(folder, "FloorPlan1", "kitchen", Frame(600, 450))) == before
     (folder / "metadata.json").write_text('{"a": {"screenWidth": 600, "screenHeight": 450}}')
     data = read(folder)
     assert rows(data) == before
     assert "frames of 600x450 by metadata.json" in data.noted
-    data = reader.read_scene(folder, "FloorPlan1", 0, Frame(1200, 900))
+    data = reader.read_scene(folder, "FloorPlan1", "kitchen", Frame(1200, 900))
     assert rows(data) != before
     assert "frames of 600x450 by metadata.json, read as 1200x900" in data.noted
     (folder / "images.hdf5").write_bytes(b"damaged")
