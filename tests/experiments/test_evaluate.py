@@ -20,6 +20,7 @@ from tdanet_jax.io.files import check_empty
 from tdanet_jax.task import make_task
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
+from tdanet_jax.vocabulary import ROOM_TYPES
 from tdanet_jax.workflows.evaluate import short_names
 from tests.agent.test_agent import OLD_RUN
 from tests.evaluation.test_comparison import result as made_up
@@ -156,7 +157,7 @@ def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch):
     class Done:
         saved = SavedNetwork(tmp_path / "a", TINY)
         snapshot = SimpleNamespace(updates=10)
-        task = SimpleNamespace(tables=None)
+        task = SimpleNamespace(tables=SimpleNamespace(room_types=ROOM_TYPES))
         played = None
 
         def results(self):
@@ -194,7 +195,11 @@ def test_only_a_point_of_a_history_has_a_share_of_the_budget(tmp_path, point, sh
     snapshot = Snapshot(None, 40, 100, 1.0, 0 if point is None else 5, "d")
     provenance = report.Provenance("18/4", "tdanet", "sample", 100, 0, 0, 1600, "d")
     done = saved_networks.Evaluated(
-        SavedNetwork(tmp_path, TINY, point), snapshot, SimpleNamespace(tables=None), provenance, {}
+        SavedNetwork(tmp_path, TINY, point),
+        snapshot,
+        SimpleNamespace(tables=SimpleNamespace(room_types=ROOM_TYPES)),
+        provenance,
+        {},
     )
     found = done.results()
     assert (found["point"], found["share"]) == (None if point is None else 5, share)

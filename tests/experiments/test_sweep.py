@@ -11,10 +11,10 @@ import threading
 import time
 
 import pytest
-from tdanet_jax.evaluation.sweep_report import Cost
 
 from experiments import evaluate, sweep
 from tdanet_jax.io import files
+from tdanet_jax.workflows.sweep_report import Cost
 from tests.evaluation.test_comparison import result
 from tests.evaluation.test_sweep import BASE, made
 from tests.support import command

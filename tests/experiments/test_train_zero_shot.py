@@ -12,7 +12,7 @@ import pytest
 import tdanet_jax
 from experiments import evaluate, train_zero_shot
 from tdanet_jax.io import files
-from tdanet_jax.training import train as training
+from tdanet_jax.workflows import train as training
 from tests.support import command
 
 WRITTEN = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 
 from tdanet_jax.env.types import FEATURES, RASTER, Observation
 from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.scenes import SceneTables
 from tdanet_jax.sensors.odometry import OdometryReading
 
 CLASSES, WIDTH, DETECTIONS = 9, 5, 6  # C, D, K
@@ -99,3 +101,10 @@ def flat(obs: Observation) -> Observation:
     """The observations of a rollout [T, B, ...] as one batch [T B, ...]."""
     lead = obs.empty.ndim
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[lead:]), obs)
+
+
+def as_version(tables: SceneTables, data_version: str) -> SceneTables:
+    """The tables under another version's name: for runs of rooms that have changed since."""
+    renamed = dataclasses.replace(tables)
+    vars(renamed)["data_version"] = data_version
+    return renamed

@@ -6,7 +6,6 @@ was recorded in the rooms of version 0.2, which have changed since.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -29,6 +28,7 @@ from tdanet_jax.training.renames import renamed
 from tdanet_jax.training.run import Run
 from tdanet_jax.vocabulary import Action
 from tdanet_jax.words import WordVectors
+from tests.support import samples
 
 DATA = Path(__file__).parents[1] / "data"
 #: With odometry and triangulation; and a network that adapts, in the middle of its episodes.
@@ -43,8 +43,7 @@ def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 @pytest.fixture
 def task(run: Path, ithor: SceneTables, glove: WordVectors) -> Task:
     """In today's rooms, which are taken for those of the run."""
-    tables = dataclasses.replace(ithor)
-    vars(tables)["data_version"] = newest(run).data_version
+    tables = samples.as_version(ithor, newest(run).data_version)
     return make_task(configs.load(run / CONFIG_FILE), tables, glove)
 
 

@@ -16,10 +16,11 @@ from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.models.factory import make_model
 from tdanet_jax.task import make_task
 from tdanet_jax.training import history
-from tdanet_jax.training.checkpoint import Checkpoints
+from tdanet_jax.training.checkpoint import Checkpoints, newest
 from tdanet_jax.training.journal import METRICS_FILE, Journal, read_metrics
 from tdanet_jax.training.run import Run, chunks_together
 from tests.agent.test_agent import OLD_RUN
+from tests.support import samples
 
 #: Eight chunks of two updates of 8 x 5 steps.
 TINY = TrainConfig(
@@ -231,7 +232,8 @@ def test_a_run_of_the_first_version_goes_on(ithor, tmp_path):
     """Its state lacks what was added since; all that was in it is still there."""
     folder = shutil.copytree(OLD_RUN, tmp_path / "run")
     config = configs.load(folder / "config.json")
-    run = Run(folder, config, make_task(config, ithor, words.load_bundled()))
+    tables = samples.as_version(ithor, newest(folder).data_version)  # the rooms have changed since
+    run = Run(folder, config, make_task(config, tables, words.load_bundled()))
     assert (int(run.state.updates), int(run.state.episodes), run.steps) == (2, 1, 16)
     read = Checkpoints(folder).snapshot()
     chex.assert_trees_all_equal(run.state.params, read.weights)
