@@ -135,8 +135,12 @@ def save_untrained(
     tables: SceneTables,
     vectors: WordVectors,
     features: np.ndarray | None = None,
+    **counts: int,
 ) -> tuple[Task, Any]:
-    """Makes a run's folder with one checkpoint: drawn parameters, an actor with opinions."""
+    """Makes a run's folder with one checkpoint: drawn parameters, an actor with opinions.
+
+    `counts` are of updates and episodes; 0 without them.
+    """
     folder.mkdir()
     (folder / CONFIG_FILE).write_text(json.dumps(configs.to_json(config)))
     task = make_task(config, tables, vectors, features=features)
@@ -146,7 +150,7 @@ def save_untrained(
     else:
         weights = samples.parameters(task.model, task.words)
         weights["actor"]["bias"] = weights["actor"]["bias"].at[Action.DONE].set(-1.0)
-    rest = {field.name: jnp.int32(0) for field in dataclasses.fields(TrainState)}
+    rest = {f.name: jnp.int32(counts.get(f.name, 0)) for f in dataclasses.fields(TrainState)}
     state = TrainState(**rest | {"params": weights, "key": jax.random.key(0)})
     Checkpoints(folder).save(state, {"seconds": 0.0, "data_version": tables.data_version})
     return task, weights

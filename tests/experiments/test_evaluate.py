@@ -22,7 +22,7 @@ from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
 from tdanet_jax.vocabulary import ROOM_TYPES
 from tdanet_jax.workflows.evaluate import short_names
-from tests.agent.test_agent import OLD_RUN
+from tests.conftest import save_untrained
 from tests.evaluation.test_comparison import result as made_up
 from tests.support import command, samples
 from tests.support.pages import block
@@ -118,14 +118,17 @@ def test_two_runs_are_compared_episode_by_episode(
     assert f"| seed1 minus {opinionated_run.name} |" in page
 
 
-def test_one_run_gives_the_files_of_a_single_result_beside_it(ithor, few_episodes, tmp_path):
-    run = shutil.copytree(OLD_RUN, tmp_path / "run")
+def test_one_run_gives_the_files_of_a_single_result_beside_it(ithor, glove, few_episodes, tmp_path):
+    run = tmp_path / "run"
+    save_untrained(TINY, run, ithor, glove, updates=3, episodes=7)
     evaluate.main(["--checkpoint", str(run), "--policy", "greedy", "--seed", "5"])
     assert {path.name for path in (run / "greedy").iterdir()} == {
         "results.json", "results.md", "episodes.jsonl"
     }  # fmt: skip
     out = json.loads((run / "greedy" / "results.json").read_text())
-    assert [out[k] for k in ("policy", "seed", "steps", "episodes_trained")] == ["greedy", 0, 16, 1]
+    assert [out[k] for k in ("policy", "seed", "steps", "episodes_trained")] == [
+        "greedy", 0, 3 * 40, 7
+    ]  # fmt: skip
     assert out["evaluation_seed"] == 5
 
 

@@ -16,7 +16,7 @@ from experiments import evaluate, sweep
 from tdanet_jax.io import files
 from tdanet_jax.workflows.sweep_report import Cost
 from tests.evaluation.test_comparison import result
-from tests.evaluation.test_sweep import BASE, made
+from tests.workflows.test_sweep import BASE, made
 from tests.support import command
 
 COMMAND = [sys.executable, "-m", "experiments.sweep"]
