@@ -52,7 +52,7 @@ def test_no_two_overlap_and_none_sticks_out(found, centred):
 
 def test_a_view_names_the_target_and_the_most_attended(ithor):
     counts = np.diff(ithor.row_start)
-    # In two of a hundred views, what is most attended is too crowded to be named; in these, it is not.
+    # In 2 of 63 views, the most attended object had no room for its name; in these, all have.
     for pose in np.flatnonzero(counts > 20)[10::3000]:
         view = camera_view.of_pose(ithor, int(pose))
         weights = np.linspace(0, 1, len(view.boxes)) ** 6

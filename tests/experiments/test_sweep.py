@@ -16,8 +16,8 @@ from experiments import evaluate, sweep
 from tdanet_jax.io import files
 from tdanet_jax.workflows.sweep_report import Cost
 from tests.evaluation.test_comparison import result
-from tests.workflows.test_sweep import BASE, made
 from tests.support import command
+from tests.workflows.test_sweep import BASE, made
 
 COMMAND = [sys.executable, "-m", "experiments.sweep"]
 TINY = [
