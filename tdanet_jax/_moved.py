@@ -1,4 +1,5 @@
-"""Where the modules of version 0.1 are now: the old names work until 0.3, with a warning."""
+"""Where modules are now: the names of version 0.1 work until 0.3, those of 0.2 until 0.4, with a
+warning."""
 
 from __future__ import annotations
 
@@ -25,16 +26,27 @@ _PACKAGES = {
     "sensors": "detections odometry triangulation",
     "training": "checkpoint devices history learner",
 }
-#: Old name -> new name, below `tdanet_jax`.
-MOVED = {name: f"{new}.{name}" for new, names in _PACKAGES.items() for name in names.split()} | {
-    "evaluation.evaluate_lists": "evaluation.rollout.evaluate_lists",
-    "graph": "models.class_graph",
-    "measure": "tools.benchmarking",
-    "parameters": "models.parameter_count",
-    "returns": "training.gae",
-    "saved": "evaluation.saved_networks",
-    "scenes.poses": "poses",
+#: Moved since version 0.2.
+_LATER = {
+    "evaluation.evaluate": "workflows.evaluate",
+    "evaluation.sweep": "workflows.sweep",
+    "evaluation.sweep_report": "workflows.sweep_report",
+    "training.train": "workflows.train",
 }
+#: Old name -> new name, below `tdanet_jax`.
+MOVED = (
+    _LATER
+    | {name: f"{new}.{name}" for new, names in _PACKAGES.items() for name in names.split()}
+    | {
+        "evaluation.evaluate_lists": "evaluation.rollout.evaluate_lists",
+        "graph": "models.class_graph",
+        "measure": "tools.benchmarking",
+        "parameters": "models.parameter_count",
+        "returns": "training.gae",
+        "saved": "evaluation.saved_networks",
+        "scenes.poses": "poses",
+    }
+)
 
 
 def attribute(name: str) -> Any:
@@ -47,7 +59,8 @@ def attribute(name: str) -> Any:
 def _warn(name: str, stacklevel: int) -> str:
     """Warns of an old name; returns the new one."""
     new = f"tdanet_jax.{MOVED[name]}"
-    message = f"tdanet_jax.{name} is now {new}; the old name works until version 0.3"
+    until = "0.4" if name in _LATER else "0.3"
+    message = f"tdanet_jax.{name} is now {new}; the old name works until version {until}"
     warnings.warn(message, DeprecationWarning, stacklevel=stacklevel)
     return new
 

@@ -3,7 +3,7 @@
 A scene file is JSON: a scene or a list of scenes, each an object with
 
     name                 unique in the file
-    room_type            kitchen, living_room, bedroom, bathroom, or a type of one's own; the flags
+    room_type            kitchen, living_room, bedroom, bathroom, or a custom type; the flags
                          of `import` may say it instead, or the name, if it is that of an iTHOR room
     objects              controller.last_event.metadata["objects"]
     reachable_positions  the actionReturn of GetReachablePositions

@@ -31,7 +31,7 @@ def complete(points: np.ndarray, objects: Sequence[SceneObject]) -> np.ndarray:
     free of the boxes of all objects there. Walls are not published, but a first ring of such
     neighbours stops at them. So beyond the first ring, a neighbour must not lie farther out than
     what is known: in each of the four directions, some point of the grid or of the first ring is
-    at least as far out, in the neighbour's own row of the grid or in one beside it.
+    at least as far out, in the neighbour's row (or column) of the grid or an adjacent one.
 
     Args:
       points: [P, 3] published points in metres, P >= 1.
@@ -59,13 +59,13 @@ def _cells(points: np.ndarray) -> np.ndarray:
 
 def _within(cells: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     """Whether `bounds` [B, 2] reach at least as far as each of `cells` [N, 2], in each direction,
-    in the cell's own row or column of the grid or one beside it: [N] bool."""
+    in the cell's row or column of the grid or an adjacent one: [N] bool."""
     offset = bounds - cells[:, None]
     result = np.ones(len(cells), bool)
     for along, across in ((0, 1), (1, 0)):
-        beside = np.abs(offset[..., across]) <= 1
-        result &= (beside & (offset[..., along] >= 0)).any(axis=1)
-        result &= (beside & (offset[..., along] <= 0)).any(axis=1)
+        adjacent = np.abs(offset[..., across]) <= 1
+        result &= (adjacent & (offset[..., along] >= 0)).any(axis=1)
+        result &= (adjacent & (offset[..., along] <= 0)).any(axis=1)
     return result
 
 

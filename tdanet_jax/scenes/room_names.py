@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes.scene import SceneError
-from tdanet_jax.splits import PARTS, SCENE_NUMBERS, TRAIN_SCENES_PER_TYPE
+from tdanet_jax.splits import ITHOR_ROOMS, PARTS, SCENE_NUMBERS, TRAIN_SCENES_PER_TYPE
 from tdanet_jax.vocabulary import ROOM_TYPES, class_words
 
 #: Bytes of UTF-8: names of rooms become names of files.
@@ -73,15 +73,11 @@ def kind_of(name: str) -> RoomKind | None:
     None: splits list these rooms by name, and `--validation` divides them further.
     """
     match = _ITHOR.match(name)
-    if match is None:
+    room = ITHOR_ROOMS.get(match[0]) if match else None
+    if match is None or room is None:
         return None
-    number = int(match[1])
-    for room in ROOM_TYPES:
-        if number in SCENE_NUMBERS[room]:
-            trains = SCENE_NUMBERS[room].index(number) < TRAIN_SCENES_PER_TYPE
-            part = PARTS[0] if trains else PARTS[1]
-            return RoomKind(room, None if match[0] == name else part)
-    return None
+    trains = SCENE_NUMBERS[room].index(int(match[1])) < TRAIN_SCENES_PER_TYPE
+    return RoomKind(room, None if match[0] == name else PARTS[0] if trains else PARTS[1])
 
 
 @dataclass(frozen=True)

@@ -134,8 +134,8 @@ def _detect(
     target = np.rint(patches.center).astype(np.int32)
     seen = ~rays.cast(cameras[position], target[patch], solids)
     least = np.where(near.reshape(-1) & (whole > 0), whole * rules.sliver, np.inf)
-    hidden_by_nothing = position[seen], patch[seen], group[seen]
-    return _boxes_in_view(grid, cameras, patches, *hidden_by_nothing, least)
+    unoccluded = position[seen], patch[seen], group[seen]
+    return _boxes_in_view(grid, cameras, patches, *unoccluded, least)
 
 
 def _boxes_in_view(

@@ -12,6 +12,8 @@ from tdanet_jax.scenes.visibility.rays import CLOSED, FARTHEST, OPEN, TURN_BITS,
 from tdanet_jax.scenes.visibility.rules import Rules
 
 MOST_PATCHES = 64  # along an edge
+FACES = [(axis, side) for axis in range(3) for side in (0, 1)]  # of a box: lower and upper sides
+BOTTOM = (1, 0)
 CELL = 0.25  # metres, cell of the floor plan in which voids are found
 BELOW, ABOVE = 1.0, 3.0  # metres that walls extend below and above the agent's y
 
@@ -59,13 +61,12 @@ def patches_of(scene: Scene, rules: Rules) -> Patches:
         lengths = np.sqrt((edges * edges).sum(axis=1))
         fine, coarse = np.minimum(lengths, 1.0), np.maximum(lengths - 1.0, 0.0)
         counts = np.clip(np.ceil((fine + coarse / 3) / rules.patch), 2, MOST_PATCHES).astype(int)
-        faces = fronts = [(axis, side) for axis in range(3) for side in (0, 1)]
+        faces = fronts = FACES
         if item.object_class in rules.fronts:
             faces = fronts = fronts_of(item, scene.points, rules.nearly)
         if item.object_class in rules.knobs:
-            hidden = {(1, 0), *((axis, 1 - side) for axis, side in fronts)} - set(fronts)
-            faces = [(axis, side) for axis in range(3) for side in (0, 1)]
-            faces = [face for face in faces if face not in hidden]
+            behind = {(axis, 1 - side) for axis, side in fronts}
+            faces = [face for face in FACES if face in fronts or face not in {BOTTOM, *behind}]
         for axis, side in faces:
             u, v = (axis + 1) % 3, (axis + 2) % 3
             grid = _unit_grid(counts[u], counts[v])
