@@ -28,9 +28,25 @@ def scene_file(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
+both = pytest.mark.parametrize(
     "trained", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["evaluated", "trained"]
 )
+
+
+def follow_the_page(name: str, trained: bool, *flags: str) -> None:
+    """Writes the page's scene file and runs the commands under it; the last, which trains, shortly
+    and with `flags`, or not at all."""
+    Path(f"{name}.json").write_text(block("scenes.md", f"{name}.json"))
+    *lines, train = block("scenes.md", f"{name} commands").splitlines()
+    if trained:
+        lines.append(shlex.join([*shlex.split(train), "--steps", "80", *flags, *TINY]))
+    for line in lines:
+        python, _, module, *given = shlex.split(line)
+        assert python == "python"
+        importlib.import_module(module).main(given)
+
+
+@both
 def test_own_rooms_as_the_page_shows_them(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -39,14 +55,7 @@ def test_own_rooms_as_the_page_shows_them(
 ) -> None:
     """From the scene file to results. What refuses rooms does so before it trains or plays."""
     monkeypatch.chdir(tmp_path)
-    Path("my_rooms.json").write_text(block("scenes.md", "my_rooms.json"))
-    *lines, train = block("scenes.md", "my_rooms commands").splitlines()
-    if trained:
-        lines.append(shlex.join([*shlex.split(train), "--steps", "80", *TINY]))
-    for line in lines:
-        python, _, module, *given = shlex.split(line)
-        assert python == "python"
-        importlib.import_module(module).main(given)
+    follow_the_page("my_rooms", trained)
     said = capsys.readouterr()
     assert said.err == ""
     assert "Rooms to train in: 1; to be evaluated in: 1" in said.out
@@ -61,9 +70,7 @@ def test_own_rooms_as_the_page_shows_them(
         assert {json.loads(row)["scene"] for row in rows} == {"Office"}
 
 
-@pytest.mark.parametrize(
-    "trained", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["evaluated", "trained"]
-)
+@both
 def test_offices_on_another_grid_as_the_page_shows_them(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -71,13 +78,7 @@ def test_offices_on_another_grid_as_the_page_shows_them(
     trained: bool,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("offices.json").write_text(block("scenes.md", "offices.json"))
-    *lines, train = block("scenes.md", "offices commands").splitlines()
-    if trained:
-        lines.append(shlex.join([*shlex.split(train), "--steps", "80", "--odometry", *TINY]))
-    for line in lines:
-        _, _, module, *given = shlex.split(line)
-        importlib.import_module(module).main(given)
+    follow_the_page("offices", trained, "--odometry")
     said = capsys.readouterr()
     assert said.err == ""
     assert "Targets in rooms of type office: Laptop\n" in said.out
