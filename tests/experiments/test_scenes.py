@@ -33,11 +33,9 @@ both = pytest.mark.parametrize(
 )
 
 
-def follow_the_page(name: str, trained: bool, *flags: str) -> None:
-    """Writes the page's scene file and runs the commands under it; the last, which trains, shortly
-    and with `flags`, or not at all."""
-    Path(f"{name}.json").write_text(block("scenes.md", f"{name}.json"))
-    *lines, train = block("scenes.md", f"{name} commands").splitlines()
+def run_commands(commands: str, trained: bool, *flags: str) -> None:
+    """Runs a block's commands; the last, which trains, shortly and with `flags`, or not at all."""
+    *lines, train = commands.splitlines()
     if trained:
         lines.append(shlex.join([*shlex.split(train), "--steps", "80", *flags, *TINY]))
     for line in lines:
@@ -55,7 +53,8 @@ def test_own_rooms_as_the_page_shows_them(
 ) -> None:
     """From the scene file to results. What refuses rooms does so before it trains or plays."""
     monkeypatch.chdir(tmp_path)
-    follow_the_page("my_rooms", trained)
+    Path("my_rooms.json").write_text(block("scenes.md", "my_rooms.json"))
+    run_commands(block("scenes.md", "my_rooms commands"), trained)
     said = capsys.readouterr()
     assert said.err == ""
     assert "Rooms to train in: 1; to be evaluated in: 1" in said.out
@@ -78,7 +77,8 @@ def test_offices_on_another_grid_as_the_page_shows_them(
     trained: bool,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    follow_the_page("offices", trained, "--odometry")
+    Path("offices.json").write_text(block("scenes.md", "offices.json"))
+    run_commands(block("scenes.md", "offices commands"), trained, "--odometry")
     said = capsys.readouterr()
     assert said.err == ""
     assert "Targets in rooms of type office: Laptop\n" in said.out
