@@ -155,38 +155,60 @@ def _boxes_in_view(
       least: [P * O] area in view from which on an object counts as visible.
     """
     area, owners = patches.area[patch], patches.owner[patch]
+    place = position * (patches.place[-1] + 2) + patches.place[patch]
     center, corner, eye = (a.astype(np.float32) for a in (patches.center, patches.corner, cameras))
     x, up, z = (center[patch, axis] - eye[position, axis] for axis in range(3))
-    corners = turned(corner[..., 0], corner[..., 2], grid.turn)
-    eyes = turned(eye[:, 0], eye[:, 2], grid.turn)
-    corners_up, eyes_up = np.ascontiguousarray(corner[..., 1]), np.ascontiguousarray(eye[:, 1])
+    radius = np.abs(corner - center[:, None]).sum(axis=-1).max(initial=0) + 1
+    # Of the four corners of each patch: the two where a run begins [Q, 2], and where it ends.
+    corners = turned(
+        *(np.stack([corner[:, ::2, a], corner[:, 1::2, a]]) for a in (0, 2)), grid.turn
+    )
+    corners_up = np.stack([corner[:, ::2, 1], corner[:, 1::2, 1]])
+    eyes, eyes_up = turned(eye[:, 0], eye[:, 2], grid.turn), np.ascontiguousarray(eye[:, 1])
     none = np.zeros(0, np.int32)
     parts = [(none, none, np.zeros((0, 4), np.int16), np.zeros(0, bool))]
     for heading, (right, ahead) in enumerate(turned(x, z, grid.turn)):
         for horizon, down in enumerate(grid.horizons):
             height, depth = tilted(up, ahead, down)
             rows = np.flatnonzero((np.abs(right) < depth) & (np.abs(height) < depth))
-            start = np.flatnonzero(np.diff(group[rows], prepend=-1))
             if len(rows) == 0:
                 continue
+            start = np.flatnonzero(np.append(True, np.diff(group[rows])))
+            found = rows[start]
+            visible = np.add.reduceat(area[rows], start) >= least[group[found]]
+            first, last = _runs(place[rows], depth[rows] < radius)
+            start = np.searchsorted(first, start)
+            first, last = rows[first], rows[last]
+            begin, end, camera = patch[first], patch[last], position[first]
             across, over, along = (
-                np.take(table, patch[rows], axis=0) - np.take(at, position[rows])[:, None]
+                np.concatenate([table[0].take(begin, axis=0), table[1].take(end, axis=0)], axis=1)
+                - at.take(camera)[:, None]
                 for table, at in (
                     (corners[heading][0], eyes[heading][0]),
                     (corners_up, eyes_up),
                     (corners[heading][1], eyes[heading][1]),
                 )
             )
-            first = rows[start]
-            state = grid.join(position[first], heading, horizon)
+            state = grid.join(position[found], heading, horizon)
             box = _extents(across, *tilted(over, along, down), start)
-            visible = np.add.reduceat(area[rows], start) >= least[group[first]]
-            parts.append((state, owners[first], box, visible))
+            parts.append((state, owners[found], box, visible))
     state, owner, box, visible = map(np.concatenate, zip(*parts, strict=True))
     order = np.lexsort((owner, state))
     return Detections(
         state[order].astype(np.int32), owner[order].astype(np.int32), box[order], visible[order]
     )
+
+
+def _runs(place: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where each run of patches that are next to one another begins and ends: two [R] indices.
+
+    A patch in the middle of a run adds nothing to the run's extent in the image: its corners lie on
+    lines between corners of the first and of the last. This does not hold for patches that reach
+    behind the camera, which stay `alone` [V].
+    """
+    apart = (place[1:] != place[:-1] + 1) | alone[1:] | alone[:-1]
+    breaks = np.flatnonzero(apart)
+    return np.append(0, breaks + 1), np.append(breaks, len(place) - 1)
 
 
 def _extents(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -26,6 +27,7 @@ class Patches:
     center: np.ndarray  # [Q, 3] float64 millimetres
     corner: np.ndarray  # [Q, 4, 3] float64 millimetres
     normal: np.ndarray  # [Q, 3] float64, outward, not normalised
+    place: np.ndarray  # [Q] ascending; neighbours along a row of a face differ by one
     area: np.ndarray  # [Q] int64 square millimetres that count for the visible flag
 
 
@@ -56,6 +58,7 @@ def fronts_of(item: SceneObject, points: np.ndarray, nearly: float) -> list[tupl
 def patches_of(scene: Scene, rules: Rules) -> Patches:
     """Divides the faces of every object that can be seen into patches."""
     parts = []
+    first = 0
     for index, item in enumerate(scene.objects):
         origin, edges = box_frame(item.box, item.corners)
         lengths = np.sqrt((edges * edges).sum(axis=1))
@@ -74,18 +77,22 @@ def patches_of(scene: Scene, rules: Rules) -> Patches:
             corner = corner + grid[..., :1] * edges[u] + grid[..., 1:] * edges[v]
             area = max(np.rint(lengths[u] * lengths[v] / len(grid) * 1e6), 1)
             area *= (axis, side) in fronts
+            place = first + np.arange(len(grid)) + np.arange(len(grid)) // counts[v]
+            first = place[-1] + 2
             if item.object_class in rules.carved:
-                corner = corner[~near_any(corner.mean(axis=1), scene.points, rules.standing)]
-            normal = np.broadcast_to(edges[axis] * (2 * side - 1), (len(corner), 3))
-            parts.append((index, corner, normal, area))
-    sizes = [len(corner) for _, corner, _, _ in parts]
-    corners = np.concatenate([corner for _, corner, _, _ in parts]) * 1000
+                free = ~near_any(corner.mean(axis=1), scene.points, rules.standing)
+                corner, place = corner[free], place[free]
+            parts.append((index, edges[axis] * (2 * side - 1), area, place, corner))
+    owner, normal, area, place, corner = zip(*parts, strict=True)
+    sizes = [len(places) for places in place]
+    corners = np.concatenate(corner) * 1000
     return Patches(
-        owner=np.repeat([index for index, *_ in parts], sizes),
+        owner=np.repeat(owner, sizes),
         center=corners.mean(axis=1),
         corner=corners,
-        normal=np.concatenate([normal for _, _, normal, _ in parts]),
-        area=np.repeat([area for *_, area in parts], sizes).astype(np.int64),
+        normal=np.repeat(normal, sizes, axis=0),
+        place=np.concatenate(place),
+        area=np.repeat(area, sizes).astype(np.int64),
     )
 
 
@@ -95,6 +102,7 @@ def near_any(places: np.ndarray, points: np.ndarray, radius: float) -> np.ndarra
     return ((offset * offset).sum(axis=-1) < radius**2).any(axis=1)
 
 
+@cache
 def _unit_grid(m: int, n: int) -> np.ndarray:
     """Corners of the m x n cells of the unit square: [m * n, 4, 2]."""
     i, j = np.meshgrid(np.arange(m), np.arange(n), indexing="ij")
