@@ -126,7 +126,7 @@ def rooms(some_rooms):
     return dataclasses.replace(some_rooms, row_box=(16 * np.hstack([low, high])).astype(np.int16))
 
 
-@pytest.fixture(scope="module", params=["plain", "sensing"])
+@pytest.fixture(scope="module", params=[pytest.param("plain", marks=pytest.mark.slow), "sensing"])
 def run(request, rooms, glove, tmp_path_factory):
     """The folder of a run with random parameters."""
     senses = request.param == "sensing"

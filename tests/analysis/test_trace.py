@@ -50,7 +50,9 @@ def triangulating_player(some_rooms, glove, tmp_path_factory):
     return trace.load_player(folder, Rooms(some_rooms, None))
 
 
-@pytest.mark.parametrize("who", ["player", "triangulating_player"])
+@pytest.mark.parametrize(
+    "who", [pytest.param("player", marks=pytest.mark.slow), "triangulating_player"]
+)
 def test_sampled_episodes_come_from_the_probabilities_and_the_stream_of_the_evaluation(
     some_rooms, who, chosen, request
 ):

@@ -206,6 +206,7 @@ def random_likeness(
     return greatest_similarity(tables, cosine), named
 
 
+@pytest.mark.slow
 def test_rewards_for_likeness_agree_with_the_slow_world(some_rooms: SceneTables) -> None:
     similarity, named = random_likeness(some_rooms, seed=5)
     world = World(some_rooms, {}, STEP_LIMITS, similarity=named)

@@ -249,7 +249,7 @@ def test_sampled_actions_follow_the_probabilities_of_the_network(
     chex.assert_shape(records.actions, (4000, 1))
 
 
-@pytest.mark.parametrize("batched", [True, False])
+@pytest.mark.parametrize("batched", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_stacked_networks_play_as_each_of_them_alone(
     rooms: SceneTables, params: EnvParams, batched: bool
 ) -> None:

@@ -281,6 +281,7 @@ def test_bad_input(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert sorted(p.name for p in here.iterdir()) == ["bad.json", "lab.json"]
 
 
+@pytest.mark.slow
 def test_verify(capsys: pytest.CaptureFixture[str]) -> None:
     scenes.main(["verify", "--rooms", "2", "--views", "1", "--worst", "3"])
     lines = capsys.readouterr().out.splitlines()

@@ -9,6 +9,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from tdanet_jax.models import sp
 from tdanet_jax.models.classes import ClassVocabulary
@@ -79,6 +80,7 @@ def test_the_fast_forms_equal_the_published_network() -> None:
     assert np.asarray(expected[..., 3136:].std(axis=(0, 1))).max() > 0.1  # the frame matters
 
 
+@pytest.mark.slow
 def test_the_fast_forms_have_the_gradient_of_the_published_network() -> None:
     mix = np.random.default_rng(1).normal(size=(T, B, 3136 + 6)).astype(np.float32)
 

@@ -98,7 +98,8 @@ def test_a_damaged_asset_is_one_line_and_nothing_is_written(
 # TensorStore's threads may report to Orbax's event loop after it has closed.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
-    ("updates", "left"), [(0, "there is no other"), (20, "the one before it is 10")]
+    ("updates", "left"),
+    [(0, "there is no other"), pytest.param(20, "the one before it is 10", marks=pytest.mark.slow)],
 )
 def test_a_disk_that_is_full_stops_the_run_before_it_loses_anything(
     ithor: Any,

@@ -87,7 +87,7 @@ def test_a_process_on_its_own_agrees_with_itself():
     [
         pytest.param("tdanet", "default", marks=pytest.mark.slow),  # best: the same and more
         ("tdanet", "best"),
-        ("mjolnir-r", "default"),
+        pytest.param("mjolnir-r", "default", marks=pytest.mark.slow),
         pytest.param("savn", "default", marks=pytest.mark.slow),
     ],
 )

@@ -234,7 +234,11 @@ def gradient(
     return jax.value_and_grad(total, has_aux=True)(state.params)
 
 
-@pytest.mark.parametrize("sensors", [False, True], ids=["plain", "triangulation"])
+@pytest.mark.parametrize(
+    "sensors",
+    [False, pytest.param(True, marks=pytest.mark.slow)],
+    ids=["plain", "triangulation"],
+)
 def test_the_activation_cache_changes_neither_the_loss_nor_its_gradient(sensors: bool) -> None:
     before, _, steps, _, advantage = example(sensors)
     model, _ = TASKS[sensors]
@@ -364,7 +368,9 @@ def test_amsgrad_forgets_a_large_first_gradient_no_faster_than_torch() -> None:
         np.testing.assert_allclose(-change, expected, rtol=1e-3)
 
 
-@pytest.mark.parametrize(("amsgrad", "progress"), [(False, 0.25), (True, 0.0)])
+@pytest.mark.parametrize(
+    ("amsgrad", "progress"), [(False, 0.25), pytest.param(True, 0.0, marks=pytest.mark.slow)]
+)
 def test_an_update_is_one_step_of_clipped_adam_on_the_gradient_of_the_loss(
     amsgrad: bool, progress: float
 ) -> None:

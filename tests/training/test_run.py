@@ -119,6 +119,7 @@ def test_the_history_holds_the_parameters_at_each_point(whole):
     assert not np.array_equal(*(point.weights["actor"]["kernel"] for point in kept[-2:]))
 
 
+@pytest.mark.slow
 def test_seeds_trained_together_go_the_way_of_each_alone(whole, task, tmp_path):
     """One seed stands two chunks ahead, as after an interruption; the other catches up alone."""
     configs = [dataclasses.replace(TINY, seed=seed) for seed in (0, 1)]

@@ -165,7 +165,7 @@ NOT_ADAPTED = ("way",)
 
 @pytest.mark.parametrize(
     "odometry",
-    [pytest.param(False, marks=pytest.mark.slow), True],
+    [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.slow)],
     ids=["plain", "odometry"],
 )
 def test_values_are_those_of_plain_per_environment_parameters(odometry: bool) -> None:
@@ -182,6 +182,7 @@ def test_values_are_those_of_plain_per_environment_parameters(odometry: bool) ->
         assert np.all(np.abs(out.logits - other.logits).max(-1) > 1e-4)
 
 
+@pytest.mark.slow
 def test_unused_parts_of_the_observations_are_not_stored() -> None:
     """The environment may have sensors that another network needs."""
     given = jax.tree.map(lambda x: x[0], inputs(odometry=True))

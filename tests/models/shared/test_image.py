@@ -26,7 +26,7 @@ MODEL = ActorCritic(BaselineEncoder(dropout=0.25), hidden=H)
 MAPS = ActorCritic(BaselineEncoder(dropout=0.25, maps=True), hidden=H)
 CASES = pytest.mark.parametrize(
     ("model", "dropped"),
-    [(MODEL, False), (MODEL, True), (MAPS, True)],
+    [pytest.param(MODEL, False, marks=pytest.mark.slow), (MODEL, True), (MAPS, True)],
     ids=["evaluating", "training", "training on feature maps"],
 )
 
