@@ -561,13 +561,13 @@ def test_rotations_of_other_grids_are_uniform_and_independent_of_the_target(rota
             )
 
 
-@pytest.mark.parametrize("which", ["some_rooms", "houses"])
-def test_every_valid_episode_is_offered_and_no_other(
-    which: str, request: pytest.FixtureRequest
-) -> None:
-    tables: SceneTables = houses() if which == "houses" else request.getfixturevalue(which)
-    targets = {"kitchen": ("Mug",), "bedroom": ("Pillow", "Mug")} if which == "houses" else TARGETS
-    world = World(tables, {}, STEP_LIMITS)
+@pytest.mark.parametrize("real", [True, False], ids=["real rooms", "houses"])
+def test_every_valid_episode_is_offered_and_no_other(some_rooms: SceneTables, real: bool) -> None:
+    tables, targets, ahead = some_rooms, TARGETS, oracle.walk_on_grid(some_rooms)
+    if not real:
+        tables, targets = houses(), {"kitchen": ("Mug",), "bedroom": ("Pillow", "Mug")}
+        ahead = None
+    world = World(tables, {}, STEP_LIMITS, ahead)
     nobody = no_parents(tables)
     params = jax.device_get(make_params(tables, targets, nobody, STEP_LIMITS, ObservationSpec()))
     found: dict[tuple[int, int, str], set[int]] = {}
