@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import math
@@ -44,7 +45,7 @@ def find(
     """One episode in a room.
 
     Args:
-      start: by default one is drawn, as for test episodes.
+      start: by default one is drawn, as for test episodes; in a house, in a room of any type.
       seed: for drawing the start.
 
     Raises:
@@ -61,8 +62,9 @@ def find(
             f"{target}: no target that can be seen in {scene}; there: {', '.join(found) or 'none'}"
         )
     if start is None:
-        room = tables.room_types[tables.room_type[index]]
-        return episodes.draw(tables, [scene], {room: [target]}, 1, seed)
+        one_type = np.zeros_like(tables.position_room_type)
+        house = dataclasses.replace(tables, position_room_type=one_type)
+        return episodes.draw(house, [scene], {tables.room_types[0]: [target]}, 1, seed)
     pose, goal = tables.nearest_state(index, *start), tables.targets.index(target)
     x, _, z = tables.position[tables.grid.split(pose).position]
     away = math.hypot(x - start.x, z - start.z)

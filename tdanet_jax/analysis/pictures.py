@@ -180,7 +180,8 @@ def room(scene: Scene, tables: SceneTables, state: int, path: Path) -> None:
         Patch(fill=False, edgecolor=BLUE, lw=1.5, label="in view, farther"),
     ]
     widths = [high * (x2 - x1) / (z2 - z1), high]
-    figure, (left, right) = _panels(2, widths, high, scene.name, handles, margin=0.5)
+    title = f"{scene.name}, {tables.room_at(state).replace('_', ' ')}"
+    figure, (left, right) = _panels(2, widths, high, title, handles, margin=0.5)
     drawing.draw_plan(left, plan, None, colors, scale=0.75)
     for low, top in void_boxes(scene, RULES):
         left.add_patch(Rectangle(low[[0, 2]], *(top - low)[[0, 2]], color="0.85", lw=0))

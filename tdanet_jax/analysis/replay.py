@@ -34,10 +34,9 @@ def page(traces: Sequence[Trace], tables: SceneTables) -> str:
     if any((t.pose[0], t.target) != (first.pose[0], first.target) for t in traces):
         raise ValueError("the traces start in different places or look for different targets")
     plan = floor_plan.of_room(tables, first.scene)
-    room = tables.room_types[tables.room_type[tables.scenes.index(first.scene)]]
     episode = {
         "scene": first.scene,
-        "room": room.replace("_", " "),
+        "room": tables.room_at(first.pose[0]).replace("_", " "),
         "target": first.target,
         "shortest": first.shortest,
         "actions": ACTION_NAMES,

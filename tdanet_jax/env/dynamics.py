@@ -34,7 +34,7 @@ def start(
 ) -> EnvState:
     """The state at the start of the given episode."""
     zero = jnp.zeros_like(pose)
-    _, rotation, horizon = params.grid.split(pose)
+    position, rotation, horizon = params.grid.split(pose)
     shortest = params.distance[pose, target].astype(jnp.int32) + 1
     state = EnvState(
         pose=pose,
@@ -44,6 +44,7 @@ def start(
         shortest=shortest,
         similarity=None if params.similarity is None else jnp.zeros_like(pose, jnp.float32),
         area_factor=area_factor,
+        room=params.position_room[position] if params.houses else None,
     )
     begun = suite.init(params.spec, Start(rotation, horizon))
     return state.replace(sensors=suite.observe(params.spec, begun, _frame(state, params)))
@@ -151,7 +152,9 @@ def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome
     reward = jnp.where(~done & earns, partial, STEP_REWARD)
     reward = jnp.where(success, DONE_REWARD + at_done, reward)
     steps = state.steps + 1
-    room = params.position_room[params.grid.split(pose).position]
+    room = state.room
+    if room is None:  # a scene has one type
+        room = params.position_room[params.grid.split(pose).position]
     limit = params.step_limit[room.astype(jnp.int32)]
     after = seen.replace(pose=pose, steps=steps)
     moved = suite.update(params.spec, after.sensors, Motion(action, pose == state.pose))

@@ -68,11 +68,10 @@ def make_params(
     start, classes, boxes = _detections(tables, spec.rows == "class")
     longest = max(int(np.diff(start).max(initial=0)), 1)
     pad = (0, longest)  # rows after the last pose, so that a window of K never leaves the table
-    position_room = tables.room_type[tables.position_scene]
     pool = _episode_pool(tables, targets, tables.scenes if scenes is None else scenes)
     return EnvParams(
         next_position=jnp.asarray(tables.next_position, jnp.int32),
-        position_room=jnp.asarray(position_room, jnp.int8),
+        position_room=jnp.asarray(tables.position_room_type, jnp.int8),
         row_start=jnp.asarray(start, jnp.int32),
         row_class=jnp.asarray(np.pad(classes.astype(np.int32), pad)),
         row_box=jnp.asarray(np.pad(boxes, (pad, (0, 0)))),
@@ -89,6 +88,7 @@ def make_params(
         first_feature=None if features is None else jnp.asarray(features.first, jnp.int32),
         spec=dataclasses.replace(spec, grid=tables.grid),
         size_noise=size_noise,
+        houses=bool((tables.room_type < 0).any()),
         **{name: jnp.asarray(v, jnp.int32) for name, v in pool.items()},
     )
 
@@ -129,9 +129,9 @@ def _episode_pool(
     total = 0
     for room, room_name in enumerate(tables.room_types):
         first_scene = len(scene_pairs)
-        for scene in np.flatnonzero((tables.room_type == room) & chosen):
+        for scene in np.flatnonzero(chosen).tolist():
             first_pair = len(pair_target)
-            positions = np.flatnonzero(tables.position_scene == scene)
+            positions = tables.positions_in(scene, room)
             for name in targets.get(room_name, ()):
                 goal = tables.targets.index(name)
                 valid = positions[reachable[positions, goal]]

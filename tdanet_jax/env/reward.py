@@ -1,8 +1,8 @@
 """Partial rewards: which objects are parents of a target, and what seeing one is worth.
 
 R_p = R_t * Pr(t | p) * 0.1 (the paper's Eq. 3 and its text). Pr(t | p) is estimated in the training
-rooms of the target's type, or types: over rooms that hold both classes, the share in which the
-nearest instances are within 1.5 m of each other.
+rooms of the target's type, or types, and in houses with such a room: over rooms that hold both
+classes, the share in which the nearest instances are within 1.5 m of each other.
 
 SSNet (Zhao et al. 2023) pays for likeness instead: 0.1 times the cosine between the word vectors of
 the target and of a class in view, whenever it is the largest of the episode so far.
@@ -98,7 +98,7 @@ def find_parents(tables: SceneTables, targets: Mapping[str, Sequence[str]]) -> P
     reward = np.zeros((len(tables.targets), PARENTS_PER_TARGET), np.float32)
     for goal, target in enumerate(tables.targets):
         sought = [target in targets.get(room, ()) for room in tables.room_types]
-        scenes = np.flatnonzero(np.array(sought)[tables.room_type])
+        scenes = np.unique(tables.position_scene[np.array(sought)[tables.position_room_type]])
         for slot, (share, name) in enumerate(_nearest_classes(tables, target, scenes)):
             classes[goal, slot] = tables.classes.index(name)
             reward[goal, slot] = DONE_REWARD * share * PARENT_SHARE

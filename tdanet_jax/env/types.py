@@ -48,6 +48,7 @@ class EnvParams(struct.PyTreeNode):
     max_detections: int = struct.field(pytree_node=False)  # K, most detections in any pose
     spec: ObservationSpec = struct.field(pytree_node=False, default=ObservationSpec())
     size_noise: float = struct.field(pytree_node=False, default=0.0)  # LearnerConfig.size_noise
+    houses: bool = struct.field(pytree_node=False, default=False)  # scenes of several room types
 
     @property
     def grid(self) -> PoseGrid:
@@ -65,6 +66,7 @@ class EnvState(struct.PyTreeNode):
     shortest: jax.Array  # int32, L: actions on the optimal path from the start, Done included
     similarity: jax.Array | None = None  # float32, largest cosine so far, if it is rewarded
     area_factor: jax.Array | None = None  # float32, of the target's boxes, if there is size noise
+    room: jax.Array | None = None  # int8, room type of the start, if there are houses
     sensors: Mapping[str, Any] = struct.field(default_factory=dict)  # states of the sensors by name
 
 

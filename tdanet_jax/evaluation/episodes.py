@@ -44,8 +44,9 @@ def draw(
 ) -> Episodes:
     """Draws episodes as training does: uniformly a scene, then a target in it, then a start.
 
-    Targets are those of the room type that can be reached from somewhere in the scene; starts are
-    positions from which the target can be reached, with any rotation and horizon 0.
+    Targets are those of the room type that can be reached from somewhere in the scene's rooms of
+    this type; starts are positions in these rooms from which the target can be reached, with any
+    rotation and horizon 0. In a house, the target may be in another room.
     """
     rng = np.random.default_rng(seed)
     index = {name: i for i, name in enumerate(tables.scenes)}
@@ -54,9 +55,7 @@ def draw(
     for kind, room in enumerate(tables.room_types):
         options = []
         for scene in scenes:
-            if tables.room_type[index[scene]] != kind:
-                continue
-            positions = np.flatnonzero(tables.position_scene == index[scene])
+            positions = tables.positions_in(index[scene], kind)
             found = [tables.targets.index(name) for name in targets.get(room, ())]
             found = [goal for goal in found if reachable[positions, goal].any()]
             if found:
@@ -131,12 +130,12 @@ def published(
             scene = scenes.get(episode.scene)
             if scene is None or episode.part != "test":
                 continue
-            if episode.target not in targets.get(tables.room_types[tables.room_type[scene]], ()):
-                continue
-            goal = tables.targets.index(episode.target)
             pose = tables.nearest_state(
                 scene, episode.x, episode.z, episode.rotation, episode.horizon
             )
+            if episode.target not in targets.get(tables.room_at(pose), ()):
+                continue
+            goal = tables.targets.index(episode.target)
             if tables.distance[pose, goal] >= 0:
                 starts.append(pose)
                 goals.append(goal)

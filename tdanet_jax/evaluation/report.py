@@ -107,7 +107,7 @@ def columns(tables: SceneTables, episodes: Episodes, records: Records) -> Column
     scene = tables.position_scene[pose.position]
     return {
         "scene": np.array(tables.scenes)[scene],
-        "room": np.array(tables.room_types)[tables.room_type[scene]],
+        "room": np.array(tables.room_types)[tables.position_room_type[pose.position]],
         "target": np.array(tables.targets)[episodes.target],
         "x": tables.position[pose.position, 0],
         "z": tables.position[pose.position, 2],

@@ -208,10 +208,11 @@ def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
 def assign_rooms(split: Split, rooms: Rooms, validation: bool = False) -> Split:
     """The split, with the rooms for which the data say "train" or "test" in that part.
 
-    The targets in a room type of the data's own are those target classes that its rooms hold, seen
-    and unseen as in the split. All other rooms stay where the split has them by name. With
-    `validation`, rooms for which the data say "test" are left out, and of those of a room type that
-    say "train" the last fifth is for evaluation, as with iTHOR's rooms.
+    The targets in a room type of the data's own are those target classes that its rooms hold, or
+    houses with such a room, seen and unseen as in the split. All other rooms stay where the split
+    has them by name. With `validation`, rooms for which the data say "test" are left out, and of
+    those of a room type that say "train" the last fifth is for evaluation, as with iTHOR's rooms.
+    Houses with rooms of several types are divided in the same way.
     """
     tables, parts = rooms.tables, {} if rooms.extras is None else rooms.extras.parts
     train = [name for name in split.train_scenes if name not in parts]
@@ -223,6 +224,7 @@ def assign_rooms(split: Split, rooms: Rooms, validation: bool = False) -> Split:
             held = [name for name in ALL_TARGETS if name in _classes_in(tables, kind)]
             seen[room] = tuple(name for name in held if name not in split.hidden)
             unseen[room] = tuple(name for name in held if name in left_out)
+    for kind in (*range(len(tables.room_types)), -1):
         own = [n for n, k in zip(tables.scenes, tables.room_type, strict=True) if k == kind]
         mine = [name for name in own if parts.get(name) == "train"]
         rest = [name for name in own if parts.get(name) == "test"]
@@ -241,6 +243,7 @@ def assign_rooms(split: Split, rooms: Rooms, validation: bool = False) -> Split:
 
 
 def _classes_in(tables: SceneTables, room_type: int) -> set[str]:
-    """The classes of the objects in the rooms of a type."""
-    objects = tables.room_type[tables.object_scene] == room_type
+    """The classes of the objects in the rooms of a type, and in houses with such a room."""
+    scenes = tables.position_scene[tables.position_room_type == room_type]
+    objects = np.isin(tables.object_scene, scenes)
     return {tables.classes[c] for c in np.unique(tables.object_class[objects])}

@@ -5,6 +5,8 @@ A scene file is JSON: a scene or a list of scenes, each an object with
     name                 unique in the file
     room_type            kitchen, living_room, bedroom, bathroom, or a custom type; the flags
                          of `import` may say it instead, or the name, if it is that of an iTHOR room
+    rooms                instead of room_type, the rooms of a house, as ProcTHOR has them: roomType
+                         and floorPolygon, its corners
     objects              controller.last_event.metadata["objects"]
     reachable_positions  the actionReturn of GetReachablePositions
     gridSize             optional, metres between neighbouring positions, 0.25 by default
@@ -34,7 +36,8 @@ from typing import Any
 import numpy as np
 
 from tdanet_jax.poses import ITHOR, TURNS, PoseGrid
-from tdanet_jax.scenes.room_names import Kinds, RoomKind, check_kind, check_name
+from tdanet_jax.scenes import house
+from tdanet_jax.scenes.room_names import Kinds, RoomKind, check_kind, check_name, known_type
 from tdanet_jax.scenes.scene import Scene, SceneError, SceneObject
 from tdanet_jax.vocabulary import IGNORED
 
@@ -200,6 +203,7 @@ def _read_scene(path: Path, document: Any, kinds: Kinds) -> Scene:
     name = document["name"]
     check_name(name, f"{path}: room name")
     room_type, part = _kind(path, name, document, kinds)
+    rooms = _rooms(name, document)
     for key in ("objects", "reachable_positions"):
         if not isinstance(document.get(key), list):
             raise SceneError(f"{name}: {key} is not a list")
@@ -220,25 +224,50 @@ def _read_scene(path: Path, document: Any, kinds: Kinds) -> Scene:
         rotation,
         grid,
     )
+    if rooms:
+        types = house.types_at(scene.points[:, [0, 2]], rooms)
+        scene = dataclasses.replace(scene, room_type=types)
     return dataclasses.replace(scene, part=part)
+
+
+def _rooms(scene: str, document: Mapping[str, Any]) -> list[house.Room]:
+    """The rooms of a house; none if the scene is a room."""
+    records = document.get("rooms")
+    if records is not None and (not isinstance(records, list) or not records):
+        raise SceneError(f"{scene}: rooms is not a list of rooms")
+    rooms = []
+    for i, record in enumerate(records or ()):
+        name = f"rooms[{i}]"
+        polygon = record.get("floorPolygon") if isinstance(record, Mapping) else None
+        if not isinstance(polygon, list) or len(polygon) < 3:
+            raise SceneError(f"{scene}: {name}: floorPolygon is not a list of 3 or more corners")
+        corners = [
+            _vector(scene, f"{name}: floorPolygon[{k}]", {"corner": corner}, "corner")
+            for k, corner in enumerate(polygon)
+        ]
+        if not isinstance(record.get("roomType"), str):
+            raise SceneError(f"{scene}: {name}: no roomType")
+        check_name(record["roomType"], f"{scene}: {name}: roomType")
+        rooms.append(house.Room(known_type(record["roomType"]), np.array(corners)[:, [0, 2]]))
+    return rooms
 
 
 def _kind(
     path: Path, name: str, document: Mapping[str, Any], kinds: Kinds
 ) -> tuple[str, str | None]:
-    """Room type and part of a scene."""
+    """Room type and part of a scene; the type is empty if its rooms have their own."""
     said = RoomKind(document.get("room_type"), document.get("split"))
     try:
         check_kind(said)
     except SceneError as error:
         raise SceneError(f"{name}: {error}") from None
     room_type, part = kinds.of(name, said)
-    if room_type is None:
+    if room_type is None and document.get("rooms") is None:
         raise SceneError(
             f'{path}: {name}: no room type; give it in the file ("room_type"), or import the file '
             "with --room-type or --rooms"
         )
-    return room_type, part
+    return room_type or "", part
 
 
 def _grid(scene: str, document: Mapping[str, Any]) -> PoseGrid:

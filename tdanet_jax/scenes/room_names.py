@@ -58,11 +58,16 @@ def check_kind(kind: RoomKind) -> None:
         if not isinstance(room_type, str):
             raise SceneError(f"room_type {room_type!r}: not a name")
         check_name(room_type, "room_type")
-        for known in ROOM_TYPES:
-            if room_type != known and class_words(room_type) == class_words(known):
-                raise SceneError(f"room_type {room_type!r}: did you mean {known}?")
+        if room_type != (known := known_type(room_type)):
+            raise SceneError(f"room_type {room_type!r}: did you mean {known}?")
     if part not in (None, *PARTS):
         raise SceneError(f"part {part!r}, not {' or '.join(PARTS)}")
+
+
+def known_type(name: str) -> str:
+    """iTHOR's room type that a name has the words of, as LivingRoom has; otherwise the name."""
+    same = (known for known in ROOM_TYPES if class_words(known) == class_words(name))
+    return next(same, name)
 
 
 def kind_of(name: str) -> RoomKind | None:

@@ -43,10 +43,17 @@ class Scene:
     """A room: where an agent can stand, and the objects around it."""
 
     name: str
-    room_type: str  # one of vocabulary.ROOM_TYPES, or a type of its own
+    room_type: str | tuple[str, ...]  # one of vocabulary.ROOM_TYPES or a type of its own; of a
+    # house with rooms of several types, that of the room at each point [P]
     points: np.ndarray  # [P, 3] float64, reachable agent positions; metres
     objects: tuple[SceneObject, ...]  # sorted by (class, id)
     default_position: np.ndarray | None = None  # [3] float64, agent in the metadata's frame
     default_rotation: int | None = None  # degrees clockwise from +z, horizon 0
     part: str | None = None  # "train" or "test" in every split; None if the name decides
     grid: PoseGrid = ITHOR
+
+    @property
+    def point_types(self) -> list[str]:
+        """The room type at each point: P names."""
+        names: list[str] = np.broadcast_to(self.room_type, len(self.points)).tolist()
+        return names

@@ -26,7 +26,7 @@ from tdanet_jax.vocabulary import FIELD_OF_VIEW, IMAGE_SIZE, ROOM_TYPES
 #: the axes above, T are the room types, A the rotations and F the units of `row_box` along the
 #: image.
 FIELDS: dict[str, tuple[str, tuple[Any, ...], int, str]] = {
-    "room_type": ("int8", ("R",), 0, "T"),
+    "position_room_type": ("int8", ("P",), 0, "T"),
     "position": ("float64", ("P", 3), 0, ""),
     "position_scene": ("int16", ("P",), 0, "R"),
     "next_position": ("int32", ("P", "A"), 0, "P"),
@@ -52,7 +52,7 @@ class SceneTables:
     classes: tuple[str, ...]  # C names, sorted
     targets: tuple[str, ...]  # G names
     object_id: tuple[str, ...]  # O names, unique within a scene
-    room_type: np.ndarray  # [R] int8, index into `room_types`
+    position_room_type: np.ndarray  # [P] int8, index into `room_types`
     position: np.ndarray  # [P, 3] float64, agent's x, y, z in metres
     position_scene: np.ndarray  # [P] int16, nondecreasing
     next_position: np.ndarray  # [P, rotations] int32, where MoveAhead leads; itself when blocked
@@ -78,6 +78,14 @@ class SceneTables:
         """S, the number of states."""
         return len(self.position) * self.grid.views
 
+    @property
+    def room_type(self) -> np.ndarray:
+        """Room type of each scene: [R] int8; -1 for a house with rooms of several types."""
+        kind = np.full(len(self.scenes), -1, np.int8)
+        kind[self.position_scene] = self.position_room_type
+        kind[self.position_scene[kind[self.position_scene] != self.position_room_type]] = -1
+        return kind
+
     @cached_property
     def row_class(self) -> np.ndarray:
         """Class of each detection row: [N] int16."""
@@ -98,6 +106,16 @@ class SceneTables:
     def reachable(self) -> np.ndarray:
         """Whether a target can be reached from a position: [P, G] bool."""
         return self.distance[self.grid.look_level(np.arange(len(self.position)))] >= 0
+
+    def room_at(self, state: int) -> str:
+        """The room type of a state."""
+        return self.room_types[self.position_room_type[self.grid.split(state).position]]
+
+    def positions_in(self, scene: int, room_type: int) -> np.ndarray:
+        """The positions in a scene's rooms of a type: [n] int."""
+        return np.flatnonzero(
+            (self.position_scene == scene) & (self.position_room_type == room_type)
+        )
 
     def visible_bits(self) -> np.ndarray:
         """Classes visible in each state: [S, ceil(C / 32)] uint32, class c is bit c % 32."""
@@ -134,14 +152,17 @@ class SceneTables:
     def _stored(self) -> Iterator[tuple[str, Any]]:
         """The fields as arrays and as plain values for JSON.
 
-        Without those of `_LATER` that have their defaults, so that the tables of iTHOR's rooms are
-        the same as before there were such fields.
+        Without those of `_LATER` that have their defaults, and with the types of scenes in place of
+        those of positions if they say the same, so that the tables of iTHOR's rooms are the same as
+        before there were such fields.
         """
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if field.name not in _LATER or value != field.default:
+            name, value = field.name, getattr(self, field.name)
+            if name == "position_room_type" and (self.room_type >= 0).all():
+                name, value = "room_type", self.room_type
+            if name not in _LATER or value != field.default:
                 plain = dataclasses.is_dataclass(value) and not isinstance(value, type)
-                yield field.name, dataclasses.asdict(value) if plain else value
+                yield name, dataclasses.asdict(value) if plain else value
 
     def subset(self, names: Iterable[str]) -> SceneTables:
         """The tables of the named scenes only, in the order of these tables.
@@ -181,14 +202,15 @@ class SceneTables:
         )
 
     def as_scene(self) -> Scene:
-        """The only room of these tables: its points, and its objects with their boxes."""
+        """The only scene of these tables: its points, and its objects with their boxes."""
+        types = tuple(self.room_types[kind] for kind in self.position_room_type)
         objects = tuple(
             SceneObject(name, self.classes[self.object_class[i]], box.reshape(2, 3))
             for i, (name, box) in enumerate(zip(self.object_id, self.object_box, strict=True))
         )
         return Scene(
             self.scenes[0],
-            self.room_types[self.room_type[0]],
+            types if self.room_type[0] < 0 else types[0],
             self.position,
             objects,
             grid=self.grid,
@@ -219,6 +241,8 @@ class SceneTables:
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> SceneTables:
         """The tables from `to_arrays`; arrays with a slash in their names are ignored."""
         own: dict[str, Any] = {name: a for name, a in arrays.items() if "/" not in name}
+        if "room_type" in own:
+            own["position_room_type"] = own.pop("room_type")[own["position_scene"]]
         rest = json.loads(own.pop("rest").tobytes())
         fields: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in rest.items()

@@ -48,7 +48,7 @@ def build(
     names = tuple(classes)
     if len(names) > MOST_CLASSES:
         raise SceneError(f"{len(names)} classes, more than {MOST_CLASSES}")
-    if len(type_names(scene.room_type for scene in scenes)) > MOST_ROOM_TYPES:
+    if len(type_names(name for scene in scenes for name in scene.point_types)) > MOST_ROOM_TYPES:
         raise SceneError(f"more than {MOST_ROOM_TYPES} room types")
 
     def build_room(scene: Scene) -> SceneTables:
@@ -78,7 +78,7 @@ def tabulate(
       next_position: [P, rotations] int32, the position after MoveAhead along each heading.
     """
     classes = sorted({item.object_class for item in scene.objects})
-    room_types = type_names([scene.room_type])
+    room_types = type_names(scene.point_types)
     object_class = np.array([classes.index(o.object_class) for o in scene.objects], np.int16)
     row_class = object_class[detections.owner]
     states = len(scene.points) * scene.grid.views
@@ -92,7 +92,7 @@ def tabulate(
         classes=tuple(classes),
         targets=tuple(targets),
         object_id=tuple(item.object_id for item in scene.objects),
-        room_type=np.array([room_types.index(scene.room_type)], np.int8),
+        position_room_type=np.array([*map(room_types.index, scene.point_types)], np.int8),
         position=scene.points,
         position_scene=np.zeros(len(scene.points), np.int16),
         next_position=next_position,

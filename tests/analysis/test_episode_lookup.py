@@ -9,6 +9,8 @@ import pytest
 
 from tdanet_jax.analysis.episode_lookup import Start, find, name_ranges, read_record
 from tdanet_jax.vocabulary import ACTION_NAMES
+from tests.support.handmade import houses
+from tests.support.oracle import World
 
 
 def test_a_start_is_the_nearest_point_with_the_heading(ithor):
@@ -29,6 +31,14 @@ def test_drawn_starts_follow_the_seed_and_can_reach_the_target(ithor):
         assert ithor.distance[pose, episode.target[0]] >= 0
     assert len({int(episode.pose[0]) for episode in drawn}) > 5
     assert find(ithor, "FloorPlan29", "Mug", seed=3).pose == drawn[3].pose
+
+
+def test_a_start_in_a_house_is_in_a_room_of_any_type():
+    tables = houses()
+    drawn = {int(find(tables, "Room1", "Mug", seed=seed).pose[0]) // 16 for seed in range(40)}
+    assert drawn == World(tables, {}, (1, 1, 1, 1)).valid_starts(1, "Mug") == {4, 5}
+    drawn = {int(find(tables, "Room0", "Mug", seed=seed).pose[0]) // 16 for seed in range(40)}
+    assert drawn == {0, 1, 2, 3}
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from tdanet_jax.analysis.trace import Player
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.scenes import camera_view
 from tdanet_jax.scenes.dataset import Rooms
+from tdanet_jax.vocabulary import ROOM_TYPES
 from tests.support import browser
 
 #: Names as a hostile scene file could hold them.
@@ -35,6 +36,14 @@ def traces(opinionated_run, some_rooms):
 
 def data_of(page):
     return json.loads(re.search(r'type="application/json">(.*?)</script>', page, re.S).group(1))
+
+
+def test_the_page_of_a_house_names_the_room_in_which_the_episode_starts(traces, some_rooms):
+    assert data_of(replay.page(traces, some_rooms))["room"] == "living room"
+    types = some_rooms.position_room_type.copy()
+    types[traces[0].pose[0] >> 4] = ROOM_TYPES.index("bathroom")
+    house = dataclasses.replace(some_rooms, position_room_type=types)
+    assert data_of(replay.page(traces, house))["room"] == "bathroom"
 
 
 def test_the_page_holds_the_traces(traces, some_rooms):

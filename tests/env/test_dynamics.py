@@ -25,7 +25,15 @@ from tdanet_jax.scenes import SceneTables
 from tdanet_jax.scenes.tabulation import build
 from tdanet_jax.vocabulary import TARGETS, Action
 from tests.support import handmade, oracle, toy
-from tests.support.handmade import Room, Sighting, corridor, lopsided, random_tables, tables_of
+from tests.support.handmade import (
+    Room,
+    Sighting,
+    corridor,
+    houses,
+    lopsided,
+    random_tables,
+    tables_of,
+)
 from tests.support.oracle import DONE, ROOMS, Detection, Episode, World, pose_of, state_of
 
 STEP_LIMITS = (7, 12, 5, 9)  # by room type; short, so that many episodes time out
@@ -100,8 +108,7 @@ def assert_valid_start(world: World, state: EnvState, row: int) -> None:
     tables = world.tables
     pose = int(state.pose[row])
     target = tables.targets[int(state.target[row])]
-    scene = int(tables.position_scene[world.pose_of(pose).position])
-    assert target in in_use(tables)[ROOMS[tables.room_type[scene]]]
+    assert target in in_use(tables)[world.room(world.pose_of(pose).position)]
     assert world.pose_of(pose).horizon == 0
     assert int(state.steps[row]) == 0
     assert int(state.parents_seen[row]) == 0
@@ -395,6 +402,17 @@ def test_the_step_limit_of_the_room_type_truncates_and_does_not_terminate(
     assert not bool(out.truncated)
 
 
+@pytest.mark.parametrize(("start", "limit"), [(1, STEP_LIMITS[0]), (2, STEP_LIMITS[2])])
+def test_the_step_limit_of_a_house_is_that_of_the_room_of_the_start(start: int, limit: int) -> None:
+    params = params_of(houses())
+    state = dynamics.start(jnp.int32(handmade.state(start, 0)), jnp.int32(0), params)
+    state = state.replace(pose=jnp.int32(handmade.state(3 - start, 0)))  # in the other room
+    for taken in range(1, limit + 1):
+        out = dynamics.transition(state, jnp.int32(1), params)
+        assert bool(out.truncated) == (taken == limit)
+        state = out.state
+
+
 @pytest.fixture(scope="module")
 def contract(some_rooms: SceneTables) -> tuple[EnvParams, EnvState, jax.Array, jax.Array]:
     """Parameters, a batch of states in mid-episode, actions and keys."""
@@ -544,10 +562,16 @@ def test_rotations_of_other_grids_are_uniform_and_independent_of_the_target(rota
             )
 
 
-def test_the_real_rooms_offer_every_valid_episode_and_no_other(some_rooms: SceneTables) -> None:
-    world = World(some_rooms, {}, STEP_LIMITS, oracle.walk_on_grid(some_rooms))
-    params = jax.device_get(params_of(some_rooms))
-    found: dict[tuple[int, str], set[int]] = {}
+@pytest.mark.parametrize("real", [True, False], ids=["real rooms", "houses"])
+def test_every_valid_episode_is_offered_and_no_other(some_rooms: SceneTables, real: bool) -> None:
+    tables, targets, ahead = some_rooms, TARGETS, oracle.walk_on_grid(some_rooms)
+    if not real:
+        tables, targets = houses(), {"kitchen": ("Mug",), "bedroom": ("Pillow", "Mug")}
+        ahead = None
+    world = World(tables, {}, STEP_LIMITS, ahead)
+    nobody = no_parents(tables)
+    params = jax.device_get(make_params(tables, targets, nobody, STEP_LIMITS, ObservationSpec()))
+    found: dict[tuple[int, int, str], set[int]] = {}
     for room in params.room_pool:
         first, count = params.room_scenes[room]
         for pairs, number in params.scene_pairs[first : first + count]:
@@ -555,16 +579,16 @@ def test_the_real_rooms_offer_every_valid_episode_and_no_other(some_rooms: Scene
                 start, length = params.pair_starts[pair]
                 positions = params.start_position[start : start + length].tolist()
                 assert len(set(positions)) == len(positions)
-                scene = int(some_rooms.position_scene[positions[0]])
-                assert some_rooms.room_type[scene] == room
-                target = some_rooms.targets[params.pair_target[pair]]
-                assert (scene, target) not in found
-                found[scene, target] = set(positions)
+                scene = int(tables.position_scene[positions[0]])
+                target = tables.targets[params.pair_target[pair]]
+                assert (room, scene, target) not in found
+                found[room, scene, target] = set(positions)
     expected = {}
-    for scene, kind in enumerate(some_rooms.room_type):
-        for target in TARGETS[ROOMS[kind]]:
-            if starts := world.valid_starts(scene, target):
-                expected[scene, target] = starts
+    for scene in range(len(tables.scenes)):
+        for room, names in targets.items():
+            for target in names:
+                if starts := world.valid_starts(scene, target, room):
+                    expected[ROOMS.index(room), scene, target] = starts
     assert found == expected
 
 

@@ -99,6 +99,20 @@ def test_rooms_of_another_type_do_not_count() -> None:
     assert parents_by_name(tables, found, "Mug") == [("Sink", pytest.approx(0.5))]
 
 
+def test_a_house_counts_for_the_targets_of_each_of_its_rooms() -> None:
+    house = furnished("kitchen", Mug=0.0, Desk=0.0, Sink=1.0)
+    house = dataclasses.replace(
+        house, kind=["kitchen", "bathroom"], next_position=corridor(2), sightings={}
+    )
+    tables = tables_of([furnished("bedroom", Mug=0.0, Sink=9.0), house], CLASSES, ["Mug"])
+    for room, worth in (("kitchen", 0.5), ("bathroom", 0.5), ("bedroom", None)):
+        found = dict(parents_by_name(tables, find_parents(tables, {room: ["Mug"]}), "Mug"))
+        assert found.get("Sink") == worth
+        targets = {room: ["Mug"]}
+        slow = oracle.parent_rewards(tables, targets, reward.PARENT_CANDIDATES, reward.MIN_SUPPORT)
+        assert found == pytest.approx(slow["Mug"])
+
+
 def test_a_parent_that_few_rooms_of_the_target_hold_is_left_out() -> None:
     rooms = [furnished("kitchen", Mug=0.0, Sink=1.0) for _ in range(4)]
     rooms.append(furnished("kitchen", Mug=0.0, Fridge=0.5))

@@ -5,16 +5,18 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from tdanet_jax.evaluation import episodes
+from tdanet_jax.evaluation import episodes, report
 from tdanet_jax.scenes import SceneTables
+from tdanet_jax.scenes.dataset import PublishedEpisode
 from tdanet_jax.splits import UNSEEN, make_split
 from tdanet_jax.vocabulary import TARGETS
-from tests.support.handmade import lopsided
+from tests.support.handmade import houses, lopsided
 from tests.support.oracle import ROOMS, World, pose_of
 
 SPLITS = [(name, validation) for name in UNSEEN for validation in (False, True)]
@@ -101,6 +103,43 @@ def test_draws_are_uniform_over_scenes_then_targets_then_starts() -> None:
     for pose, goal in set(zip(chosen.pose.tolist(), chosen.target.tolist(), strict=True)):
         assert world.distance(pose, tables.targets[goal]) is not None
         assert pose_of(pose).horizon == 0
+
+
+def test_in_a_house_the_room_of_the_start_says_what_is_looked_for() -> None:
+    """Wherever in the house it is; each house counts once for each of its rooms' types."""
+    tables = houses()
+    targets = {"kitchen": ("Mug",), "bedroom": ("Pillow", "Mug")}
+    chosen = episodes.draw(tables, tables.scenes, targets, 2_000, seed=0)
+    position, goal = chosen.pose // 16, chosen.target
+    home = tables.position_scene[position]
+    world, kitchen = World(tables, {}, (1, 1, 1, 1)), np.arange(4000) < 2000
+    assert {world.room(p) for p in position[kitchen]} == {"kitchen"}
+    assert {world.room(p) for p in position[~kitchen]} == {"bedroom"}
+    for room, names in targets.items():
+        for scene in range(2):
+            for target in names:
+                here = (goal == tables.targets.index(target)) & (
+                    tables.position_scene[position] == scene
+                )
+                drawn = set(position[here & (kitchen == (room == "kitchen"))].tolist())
+                assert drawn == world.valid_starts(scene, target, room)
+    counts = Counter(home[kitchen].tolist())
+    assert stats.chisquare(list(counts.values())).pvalue > 1e-6
+    rows = report.columns(tables, chosen, SimpleNamespace(shortest=0, length=0, success=0))
+    assert rows["room"].tolist() == ["kitchen"] * 2000 + ["bedroom"] * 2000
+
+
+def test_published_episodes_of_a_house_follow_the_room_of_their_start() -> None:
+    tables = houses()
+    listed = [
+        PublishedEpisode("test", "Room0", 0.25 * place, 0.0, 0, 0, target)
+        for place in range(4)
+        for target in ("Mug", "Pillow")
+    ]
+    split = dataclasses.replace(make_split("22/0"), eval_scenes=("Room0",))
+    found = episodes.published(tables, split, listed)["seen"]
+    assert found.pose.tolist() == [0, 16, 32, 48]
+    assert [tables.targets[goal] for goal in found.target] == ["Mug", "Mug", "Pillow", "Pillow"]
 
 
 def test_equal_seeds_give_equal_lists(some_rooms: SceneTables) -> None:

@@ -101,6 +101,37 @@ def test_offices_on_another_grid_as_the_page_shows_them(
     assert len(rooms.tables.position) * 4 == rooms.tables.num_states
 
 
+@both
+def test_houses_as_the_page_shows_them(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    trained: bool,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("houses.json").write_text(block("scenes.md", "houses.json"))
+    imports, inspects, evaluates, trains = block("scenes.md", "houses commands").splitlines()
+    lines = [imports, inspects, *[evaluates] * trained, trains]
+    run_commands("\n".join(lines), trained)
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert "Of these, houses with rooms of several types: 2; positions: kitchen 3, bedroom 3" in (
+        said.out
+    )
+    tables = dataset.load_rooms("houses.npz").tables
+    assert tables.position_room_type.tolist() == [0, 0, 2, 2, 2, 0]
+    assert tables.reachable.all()
+    for folder in Path("runs").iterdir() if trained else ():
+        rows = [json.loads(row) for row in (folder / "episodes.jsonl").read_text().splitlines()]
+        pairs = {(row["scene"], row["room"], row["target"], row["z"]) for row in rows}
+        assert pairs == {
+            ("House-2", "kitchen", "Mug", 0.5),
+            ("House-2", "bedroom", "Pillow", 0.25),
+        }
+        results = json.loads((folder / "results.json").read_text())
+        assert list(results["by_room"]) == ["kitchen", "bedroom"]
+
+
 LABELS = "name,room_type,part\nFloorPlan1-1,kitchen,train\nFloorPlan_Train1_1,hall,\n"
 
 

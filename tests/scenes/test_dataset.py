@@ -15,6 +15,7 @@ from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneTables, dataset, tabulation
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode, Rooms
+from tdanet_jax.scenes.offline import exporter
 from tdanet_jax.splits import make_split
 from tdanet_jax.vocabulary import ROOM_TYPES
 from tests.support import toy
@@ -55,6 +56,7 @@ def test_tables_alone_are_a_file_of_rooms(rooms: SceneTables, tmp_path: Path) ->
 
 BREAKS: list[tuple[str, Any]] = [
     ("room_type", lambda a: a + 9),
+    ("room_type", lambda a: a.astype(np.int16)),
     ("position", lambda a: a * np.nan),
     ("position", lambda a: a[:-1]),
     ("position_scene", lambda a: a[::-1]),
@@ -81,8 +83,12 @@ BREAKS: list[tuple[str, Any]] = [
 @pytest.mark.parametrize("case", range(len(BREAKS)))
 def test_inconsistent_arrays_are_refused(rooms: SceneTables, tmp_path: Path, case: int) -> None:
     name, change = BREAKS[case]
-    broken = dataclasses.replace(rooms, **{name: change(getattr(rooms, name))})
-    broken.save(tmp_path / "rooms.npz")
+    arrays = rooms.to_arrays()
+    rest = json.loads(arrays["rest"].tobytes())
+    fields: dict[str, Any] = arrays if name in arrays else rest
+    fields[name] = change(fields[name])
+    arrays["rest"] = np.frombuffer(json.dumps(rest).encode(), np.uint8)
+    archive.write(tmp_path / "rooms.npz", arrays)
     with pytest.raises(FileError, match=r"rooms\.npz: not a file of rooms \(") as error:
         dataset.load_rooms(tmp_path / "rooms.npz")
     assert str(error.value).isprintable()
@@ -194,6 +200,40 @@ def test_room_types_of_ones_own(tmp_path: Path) -> None:
     )
     with pytest.raises(FileError, match="is a path"):
         dataset.load_rooms(path)
+
+
+def test_houses(tmp_path: Path) -> None:
+    """Each position keeps the type of its room, and of the targets that a type of its own has."""
+    shown = toy.thing("Laptop", (0.0, toy.CAMERA, 2.0)), toy.thing("Mug", (0.2, toy.CAMERA, 2.0))
+    types = {"K": "kitchen", "H1": ("kitchen", "hall", "hall"), "H2": ("den", "den", "kitchen")}
+    types |= {f"H{i}": ("bedroom", "bedroom", "kitchen") for i in range(3, 6)}
+    scenes = [
+        dataclasses.replace(toy.room(toy.line(3), *shown[: 2 - (name == "H2")], name=name),
+                            room_type=kinds)
+        for name, kinds in types.items()
+    ]  # fmt: skip
+    tables = tabulation.build(scenes)
+    assert tables.room_types == (*ROOM_TYPES, "den", "hall")
+    assert tables.position_room_type[:9].tolist() == [0, 0, 0, 0, 5, 5, 4, 4, 0]
+    assert tables.room_type.tolist() == [0, *[-1] * 5]
+    assert [tables.room_at(16 * position) for position in (3, 4, 6)] == ["kitchen", "hall", "den"]
+    path = tmp_path / "rooms.npz"
+    parts = {name: "train" for name in types if name != "K"}
+    dataset.save_rooms(Rooms(tables, Extras(parts=parts)), path)
+    rooms = dataset.load_rooms(path)
+    assert rooms.tables.position_room_type.tolist() == tables.position_room_type.tolist()
+    assert rooms.tables.subset(["H2"]).as_scene().room_type == types["H2"]
+    others = tabulation.build([dataclasses.replace(scenes[1], room_type=("kitchen",) * 3)])
+    plain = tabulation.build([dataclasses.replace(scenes[1], room_type="kitchen")])
+    assert others.data_version == plain.data_version != tables.subset(["H1"]).data_version
+    assert plain.to_arrays()["room_type"].tolist() == [0]  # as files were before there were houses
+    split = dataset.assign_rooms(make_split("22/0"), rooms)
+    assert (split.seen["hall"], split.seen["den"]) == (("Mug", "Laptop"), ("Laptop",))
+    split = dataset.assign_rooms(make_split("22/0", True), rooms, True).within(types, ("Mug",))
+    assert split.train_scenes == ("H1", "H2", "H3", "H4")
+    assert split.eval_scenes == ("H5",)
+    with pytest.raises(ValueError, match="houses with rooms of several types: the original"):
+        exporter.check_layout(tables.subset(["K", "H5"]))
 
 
 def test_other_archives(rooms: SceneTables, tmp_path: Path) -> None:

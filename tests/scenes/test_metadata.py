@@ -96,6 +96,27 @@ def test_a_room_may_have_a_grid_of_its_own(tmp_path: Path) -> None:
     assert len(read(tmp_path, [document, other])) == 2
 
 
+def square(room_type: str, low: float, high: float, **other: Any) -> dict[str, Any]:
+    """A room of 2 m from `low` to `high` metres along z."""
+    corners = [(-1.0, low), (1.0, low), (1.0, high), (-1.0, high)]
+    polygon = [{"x": x, "y": 0.0, "z": z} for x, z in corners]
+    return {"roomType": room_type, "floorPolygon": polygon, "id": "room|2", "children": []}
+
+
+def test_the_rooms_of_a_house(tmp_path: Path) -> None:
+    """A doorway, at 0.25 m, is of the nearer room; a room without a point has no type."""
+    house = {key: value for key, value in DOCUMENT.items() if key != "room_type"}
+    for door, found in ((0.2, "Attic"), (0.3, "living_room")):
+        rooms = [
+            square("Attic", door + 0.08, 1.0), square("LivingRoom", -1.0, door - 0.08),
+            square("Garage", 5.0, 6.0),
+        ]  # fmt: skip
+        [scene] = read(tmp_path, {**house, "rooms": rooms})
+        assert scene.room_type == ("living_room", found, "Attic")
+    assert read(tmp_path, {**DOCUMENT, "rooms": rooms})[0].room_type == scene.room_type
+    assert read(tmp_path, {**DOCUMENT, "rooms": None})[0].room_type == "bedroom"
+
+
 @pytest.mark.parametrize(("horizon", "turn"), [(30.0, 0.0), (0.0, 20.0)])
 def test_odd_poses_are_not_default_frames(tmp_path: Path, horizon: float, turn: float) -> None:
     document = copy.deepcopy(DOCUMENT)
@@ -137,6 +158,22 @@ CASES = [
     (["room_type"], 3, "Lab: room_type 3: not a name"),
     (["room_type"], "", "Lab: room_type '': empty"),
     (["room_type"], "Living Room", "Lab: room_type 'Living Room': did you mean living_room?"),
+    (["rooms"], [], "Lab: rooms is not a list of rooms"),
+    (["rooms"], {}, "Lab: rooms is not a list of rooms"),
+    (["rooms"], [3], r"Lab: rooms\[0\]: floorPolygon is not a list of 3 or more corners"),
+    (["rooms"], [{"roomType": "Kitchen"}], r"Lab: rooms\[0\]: floorPolygon is not a list"),
+    (
+        ["rooms"],
+        [square("A", 0, 1) | {"floorPolygon": [{"x": 0, "y": 0, "z": 0}] * 2}],
+        r"Lab: rooms\[0\]: floorPolygon is not a list of 3 or more corners",
+    ),
+    (
+        ["rooms"],
+        [square("A", 0, 1), square("B", 1, NAN)],
+        r"Lab: rooms\[1\]: floorPolygon\[2\]: corner is not x, y, z, finite",
+    ),
+    (["rooms"], [square("A", 0, 1) | {"roomType": None}], r"Lab: rooms\[0\]: no roomType"),
+    (["rooms"], [square("a/b", 0, 1)], r"Lab: rooms\[0\]: roomType 'a/b': is a path"),
     (["name"], " ", "room name ' ': empty, longer than"),
     (["name"], "x" * 201, "longer than 200 bytes"),
     (["name"], "../Lab", "room name '../Lab': is a path"),
@@ -202,6 +239,7 @@ places = st.sampled_from(
         ["agent", "cameraHorizon"],
         ["name"],
         ["room_type"],
+        ["rooms"],
         ["split"],
         ["gridSize"],
         ["rotateStepDegrees"],

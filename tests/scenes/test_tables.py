@@ -140,7 +140,7 @@ def test_the_version_follows_every_field(rooms: SceneTables, field: str) -> None
     value = getattr(rooms, field)
     if isinstance(value, np.ndarray):
         changed = value.copy()
-        changed.flat[-1] = ~changed.flat[-1] if value.dtype == bool else changed.flat[-1] + 1
+        changed.flat[-1] = ~changed.flat[-1] if value.dtype == bool else changed.flat[-1] - 1
     elif isinstance(value, tuple):
         changed = (*value[:-1], value[-1] + "x")
     elif isinstance(value, PoseGrid):

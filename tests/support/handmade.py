@@ -29,7 +29,7 @@ class Sighting:
 class Room:
     """One room, all indices counted from its own first entry."""
 
-    kind: str
+    kind: str | Sequence[str]  # of a house, at each position
     next_position: Sequence[Sequence[int]]  # [P][rotations], by heading
     objects: Sequence[tuple[str, tuple[float, float, float]]]  # class and centre in metres
     sightings: Mapping[int, Sequence[Sighting]]  # state -> what is in view
@@ -64,7 +64,14 @@ def tables_of(
         classes=tuple(classes),
         targets=tuple(targets),
         object_id=tuple(f"{name}|{i}" for i, (name, _) in enumerate(all_objects)),
-        room_type=np.array([ROOMS.index(room.kind) for room in rooms], np.int8),
+        position_room_type=np.array(
+            [
+                ROOMS.index(kind)
+                for room in rooms
+                for kind in np.broadcast_to(room.kind, len(room.next_position))
+            ],
+            np.int8,
+        ),
         position=np.column_stack([np.arange(sum(positions)) * 0.25, np.zeros((sum(positions), 2))]),
         position_scene=np.repeat(np.arange(len(rooms), dtype=np.int16), positions),
         next_position=np.concatenate(
@@ -127,6 +134,23 @@ def lopsided() -> SceneTables:
     return tables_of(rooms, ["Bread", "Mug"], ["Mug", "Bread"])
 
 
+def houses() -> SceneTables:
+    """Two houses with a kitchen and a bedroom, a corridor each.
+
+    In the second, which has a closet that is cut off, nobody gets from the bedroom to the kitchen.
+    """
+    objects = [("Mug", (0.0, 1.0, 0.0)), ("Pillow", (0.0, 1.0, 1.0))]
+    sightings = {state(0, 0): [Sighting(0)], state(3, 0): [Sighting(1)]}
+    shut = corridor(5)
+    shut[2][4], shut[3][0], shut[4][4] = 2, 3, 4
+    kinds = ["kitchen", "kitchen", "bedroom", "bedroom"]
+    rooms = [
+        Room(kinds, corridor(4), objects, sightings),
+        Room([*kinds, "bedroom"], shut, objects, sightings),
+    ]
+    return tables_of(rooms, ["Mug", "Pillow"], ["Mug", "Pillow"])
+
+
 @st.composite
 def random_tables(draw: st.DrawFn) -> SceneTables:
     """Tables of up to four rooms with arbitrary turns, moves (one-way ones too) and detections.
@@ -164,7 +188,9 @@ def random_tables(draw: st.DrawFn) -> SceneTables:
             ]
             for place in range(grid.views * count)
         }
-        rooms.append(Room(kind, ahead.tolist(), objects, sightings))
+        house = rng.random() < 0.3
+        kinds_at = rng.choice(ROOMS, count).tolist() if house else kind
+        rooms.append(Room(kinds_at, ahead.tolist(), objects, sightings))
     # One target is always in view somewhere, so that an episode is possible.
     rooms[0].sightings[0] = [Sighting(0, _random_box(rng), True)]
     always = rooms[0].objects[0][0]

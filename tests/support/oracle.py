@@ -64,6 +64,9 @@ class Episode:
     parents_seen: set[str] = dataclasses.field(default_factory=set)
     most_similar: float = 0.0
 
+    def __post_init__(self) -> None:
+        self.start = self.pose
+
 
 class Outcome(NamedTuple):
     """What an action led to; the episode itself was changed."""
@@ -184,13 +187,13 @@ class World:
 
     def room(self, position: int) -> str:
         """Room type that a position lies in."""
-        return ROOMS[self.tables.room_type[self.tables.position_scene[position]]]
+        return ROOMS[self.tables.position_room_type[position]]
 
     def act(self, episode: Episode, action: int) -> Outcome:
         """One action of an episode: Eq. 3's reward and how it ends, if it does."""
         episode.pose = self.moved(episode.pose, action)
         episode.steps += 1
-        limit = self.step_limits[ROOMS.index(self.room(episode.pose.position))]
+        limit = self.step_limits[ROOMS.index(self.room(episode.start.position))]
         timed_out = action != DONE and episode.steps >= limit
         success = action == DONE and episode.target in self.visible(self.state_of(episode.pose))
         partial = self.seen_parents if self.similarity is None else self.seen_likeness
@@ -256,12 +259,14 @@ class World:
                 return action
         return DONE
 
-    def valid_starts(self, scene: int, target: str) -> set[int]:
-        """Positions of a scene from which the target can be reached, looking level."""
+    def valid_starts(self, scene: int, target: str, room: str | None = None) -> set[int]:
+        """Positions of a scene, or of its rooms of a type, from which the target can be reached."""
         positions = np.flatnonzero(self.tables.position_scene == scene)
         reached = self.distances(scene, target)
         return {
-            int(p) for p in positions if any(state in reached for state in self.level_states(p))
+            int(p)
+            for p in positions
+            if room in (None, self.room(p)) and any(s in reached for s in self.level_states(p))
         }
 
     def valid_targets(self, scene: int, among: Sequence[str]) -> list[str]:
@@ -318,7 +323,8 @@ def parent_rewards(
         here.setdefault(tables.classes[kind], []).append((box[:3] + box[3:]) / 2)
     result: dict[str, dict[str, float]] = {}
     for room, names in targets.items():
-        scenes = [i for i, kind in enumerate(tables.room_type) if ROOMS[kind] == room]
+        pairs = zip(tables.position_scene, tables.position_room_type, strict=True)
+        scenes = sorted({scene for scene, kind in pairs if ROOMS[kind] == room})
         for target in names:
             with_target = [s for s in scenes if target in centres.get(s, {})]
             ranked = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,6 +78,12 @@ def summary(tables: SceneTables) -> Iterator[str]:
         f"{tables.num_states:,} states, {len(tables.row_object):,} detections, "
         f"{len(tables.classes)} classes; tables {tables.data_version}"
     )
+    houses = tables.room_type < 0
+    if houses.any():
+        counts = np.bincount(tables.position_room_type[houses[tables.position_scene]])
+        pairs = zip(tables.room_types, counts, strict=False)
+        listed = ", ".join(f"{room} {count:,}" for room, count in pairs if count)
+        yield f"Of these, houses with rooms of several types: {houses.sum()}; positions: {listed}"
     if split := disconnected_rooms(tables):
         listed = ", ".join(f"{name} ({count} parts)" for name, count in split.items())
         yield f"Reachable points not all connected: {listed}"
@@ -115,7 +121,7 @@ def uses(rooms: Rooms) -> Iterator[str]:
         use for use, names in purposes.items() if names and not _hold_target(tables, names, split)
     ]
     if empty:
-        types = [room for i, room in enumerate(tables.room_types) if i in tables.room_type]
+        types = [tables.room_types[kind] for kind in np.unique(tables.position_room_type)]
         listed = "; ".join(f"in a {room}, {_listed(split.seen[room])}" for room in types)
         warnings.warn(
             f"no room to {' or to '.join(empty)} holds a target that can be found there, and a run "
@@ -132,11 +138,12 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names) or "none"
 
 
-def _hold_target(tables: SceneTables, rooms: Iterable[str], split: Split) -> bool:
+def _hold_target(tables: SceneTables, rooms: Sequence[str], split: Split) -> bool:
     """Whether an episode can start in any of these rooms."""
-    for room in map(tables.scenes.index, rooms):
-        targets = split.seen[tables.room_types[tables.room_type[room]]]
-        goals = [tables.targets.index(name) for name in targets if name in tables.targets]
-        if tables.reachable[tables.position_scene == room][:, goals].any():
+    chosen = np.isin(np.array(tables.scenes), rooms)[tables.position_scene]
+    for kind, room in enumerate(tables.room_types):
+        here = chosen & (tables.position_room_type == kind)
+        goals = [tables.targets.index(name) for name in split.seen[room] if name in tables.targets]
+        if tables.reachable[here][:, goals].any():
             return True
     return False

@@ -73,6 +73,7 @@ def _restrict(tables: SceneTables, positions: np.ndarray) -> SceneTables:
         tables,
         position=tables.position[positions],
         position_scene=tables.position_scene[positions],
+        position_room_type=tables.position_room_type[positions],
         next_position=next_position,
         row_start=row_offsets(np.diff(tables.row_start)[states]),
         row_object=tables.row_object[rows],

@@ -80,10 +80,16 @@ def write_folder(
 
 def check_layout(tables: SceneTables) -> None:
     """Raises ValueError if the original layout cannot hold these rooms."""
-    own = [tables.room_types[kind] for kind in tables.room_type if kind >= len(ROOM_TYPES)]
-    if own or tables.grid != ITHOR:
-        what = f"rooms of type {own[0]}" if own else "rooms on another grid than iTHOR's"
-        raise ValueError(f"{what}: the original layout has iTHOR's room types and grid alone")
+    last = tables.room_types[tables.position_room_type.max()]
+    if last not in ROOM_TYPES:
+        what = f"rooms of type {last}"
+    elif (tables.room_type < 0).any():
+        what = "houses with rooms of several types"
+    elif tables.grid != ITHOR:
+        what = "rooms on another grid than iTHOR's"
+    else:
+        return
+    raise ValueError(f"{what}: the original layout has rooms of iTHOR's types and grid alone")
 
 
 def write_scene(room: SceneTables, folder: Path) -> None:

@@ -106,7 +106,7 @@ def tables_of(data: reader.SceneData) -> SceneTables:
 def test_random_rooms(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     draw = np.random.default_rng(seed)
     room = tabulation.build([toy.random_room(draw, name="FloorPlan5")])
-    room = dataclasses.replace(room, room_type=np.zeros(1, np.int8))
+    room = dataclasses.replace(room, position_room_type=np.zeros(len(room.position), np.int8))
     folder = tmp_path_factory.mktemp("random") / "FloorPlan5"
     folder.mkdir()
     exporter.write_scene(room, folder)
