@@ -184,9 +184,24 @@ class Labels:
 
 @cache
 def bundled() -> dict[str, tuple[str, ...]]:
-    """The bundled table: AI2-THOR's class names, then other everyday names -> their synonyms."""
+    """The bundled table, name -> other names of the same thing.
+
+    The names are AI2-THOR's classes, which begin with a capital letter, and then those of everyday
+    things that AI2-THOR lacks, which do not.
+    """
     table = json.loads(assets.path(ASSET).read_text(encoding="utf-8"))
     return {name: tuple(others) for name, others in table.items()}
+
+
+def ai2thor_class(label: str) -> str | None:
+    """The class of AI2-THOR that a label means, according to the bundled table."""
+    name = _bundled_labels().find(label)
+    return name if name is not None and name[0].isupper() else None
+
+
+@cache
+def _bundled_labels() -> Labels:
+    return Labels()
 
 
 def build_asset(out_dir: Path) -> Path:

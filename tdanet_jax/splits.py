@@ -9,9 +9,8 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from collections.abc import Collection
-from functools import cache
 
-from tdanet_jax.labels import Labels
+from tdanet_jax.labels import ai2thor_class
 from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TARGETS, class_words
 
 #: Scene numbers of each room type, in AI2-THOR's numbering; the first 20 train, the last 10 test.
@@ -179,7 +178,7 @@ def file_name(split: str) -> str:
 
 def _target_class(word: str, text: str) -> str:
     """The target class that `word` means."""
-    name = _target_labels().find(word)
+    name = ai2thor_class(word)
     if name in ALL_TARGETS:
         return name
     keys = {"".join(class_words(name)): name for name in ALL_TARGETS}
@@ -195,11 +194,6 @@ def _target_class(word: str, text: str) -> str:
         f"--split {text}: {problem}choose one of {', '.join(UNSEEN)}, or name the unseen classes, "
         f"separated by commas, among {', '.join(ALL_TARGETS)}"
     )
-
-
-@cache
-def _target_labels() -> Labels:
-    return Labels(ALL_TARGETS)
 
 
 def _held_out(room: str, missing: Collection[str]) -> tuple[str, ...]:

@@ -68,6 +68,7 @@ def spellings(name: str) -> list[str]:
 
 @pytest.mark.parametrize("name", CLASSES)
 def test_a_class_is_itself_however_it_is_written(of_agents: Labels, name: str) -> None:
+    assert {labels.ai2thor_class(label) for label in spellings(name)} == {name}
     for labels_ in (of_agents, Labels()):
         assert {labels_.find(label) for label in (name, *spellings(name))} == {name}
 
@@ -100,6 +101,7 @@ def test_names_of_the_same_thing(of_agents: Labels, label: str, meaning: str) ->
 )  # fmt: skip
 def test_names_of_other_things_are_no_class(of_agents: Labels, label: str) -> None:
     assert of_agents.resolve(label) not in CLASSES
+    assert labels.ai2thor_class(label) is None
 
 
 def test_the_bundled_table() -> None:
