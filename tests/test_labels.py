@@ -45,6 +45,7 @@ def of_agents(glove: WordVectors) -> Labels:
 
 def test_every_name_of_coco_is_accepted(of_agents: Labels, glove: WordVectors) -> None:
     assert len(set(COCO)) == 80
+    assert sum(labels.ai2thor_class(label) is not None for label in COCO) == 26  # as the docs say
     own = {"".join(class_words(name)): name for name in CLASSES}
     for label in COCO:
         meaning = of_agents.resolve(label)
