@@ -28,7 +28,7 @@ class Choice:
     scene: str | None = None
     """Room, such as FloorPlan228; requires --target."""
     target: str | None = None
-    """Target class, such as Laptop; requires --scene."""
+    """Target class by any of its names, such as Laptop or tv; requires --scene."""
     start: tuple[float, float, int] | None = None
     """x and z in metres, rotation in degrees (in iTHOR a multiple of 45). The episode starts at the
     nearest reachable point, at most 0.5 m away. By default, a start is drawn."""

@@ -10,6 +10,7 @@ import dataclasses
 import difflib
 from collections.abc import Collection
 
+from tdanet_jax.labels import ai2thor_class
 from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TARGETS, class_words
 
 #: Scene numbers of each room type, in AI2-THOR's numbering; the first 20 train, the last 10 test.
@@ -176,11 +177,12 @@ def file_name(split: str) -> str:
 
 
 def _target_class(word: str, text: str) -> str:
-    """The target class that `word` names, regardless of capitals, spaces and hyphens."""
+    """The target class that `word` means."""
+    name = ai2thor_class(word)
+    if name in ALL_TARGETS:
+        return name
     keys = {"".join(class_words(name)): name for name in ALL_TARGETS}
     key = "".join(class_words(word))
-    if key in keys:
-        return keys[key]
     if not key and "," in text:
         raise ValueError(f"--split {text}: a comma without a class on both sides")
     if near := difflib.get_close_matches(key, keys, n=1):

@@ -1,7 +1,8 @@
 """Word vectors, bundled or from a file, and the vectors of class names.
 
 The bundled file holds, in float16, glove.6B.50d (Pennington et al. 2014) for its most frequent
-words and for every word in AI2-THOR's class names, so that almost any English label has a vector.
+words, for every word in AI2-THOR's class names and for every word in the table of everyday labels
+(`labels.json`), so that almost any English label has a vector.
 """
 
 from __future__ import annotations
@@ -177,7 +178,7 @@ def build_asset(wheel: Path, out_dir: Path, names: Iterable[str]) -> Path:
     Args:
       wheel: the wheel file, which is read as a zip and never installed.
       out_dir: the folder that receives `words.npz`.
-      names: class names, whose words are kept even if they are rare.
+      names: class names and labels, whose words are kept even if they are rare.
 
     Returns:
       The path of the file written.

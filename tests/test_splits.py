@@ -103,6 +103,14 @@ def test_a_custom_split_hides_the_classes_that_it_names(
     assert re.fullmatch(r"[A-Za-z0-9-]+", file_name(split.name))
 
 
+def test_a_custom_split_takes_any_name_of_a_class() -> None:
+    assert split_name("tv, Arm-Chairs,mugs") == "Mug,Television,ArmChair"
+    with pytest.raises(ValueError, match="--split tv,television: Television is given twice"):
+        split_name("tv,television")
+    with pytest.raises(ValueError, match="--split couch,Mug: no target is called couch"):
+        split_name("couch,Mug")
+
+
 def test_every_set_of_classes_has_its_own_name_and_file_name() -> None:
     sets = [c for count in (1, 2, 3) for c in itertools.combinations(ALL_TARGETS, count)]
     found = [split_name(",".join(classes)) for classes in sets]

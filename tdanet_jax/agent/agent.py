@@ -8,6 +8,7 @@ state, decision = agent.act(state, [Detection("mug", 0.2, 0.3, 0.25, 0.4)], targ
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from tdanet_jax import config as configs
 from tdanet_jax import words as word_vectors
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.env.types import Observation
+from tdanet_jax.labels import LabelError, Labels, Synonyms
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
 from tdanet_jax.models.classes import ClassVocabulary, load_vocabulary
@@ -37,9 +39,18 @@ from tdanet_jax.words import WordVectors
 ROW_BLOCK, LABEL_BLOCK = 16, 64
 
 
+#: Share of the image by which a detection's box may reach beyond it: a pixel of any image of at
+#: least 100 pixels, and more than what rounding adds in half precision or eight bits.
+OVERHANG = 0.01
+
+
 @dataclasses.dataclass(frozen=True)
 class Detection:
-    """One detected object: a label in English and its box as shares of the image, y down."""
+    """One detected object: a label in English and its box as shares of the image, y down.
+
+    A box that reaches up to 1% (`OVERHANG`) beyond the image, as detectors round, is clipped to the
+    image; `clipped` does so with any box.
+    """
 
     label: str
     x1: float
@@ -48,9 +59,41 @@ class Detection:
     y2: float
 
     def __post_init__(self) -> None:
-        """Raises ValueError if the box is not one inside the image."""
-        if not (0 <= self.x1 <= self.x2 <= 1 and 0 <= self.y1 <= self.y2 <= 1):
-            raise ValueError(f"{self}: corners must be shares of the image, x1 <= x2 and y1 <= y2")
+        """Clips the box.
+
+        Raises:
+          ValueError: a corner is not finite or too far outside of the image, corners are in the
+            wrong order, or the whole box is outside.
+        """
+        corners = (self.x1, self.y1, self.x2, self.y2)
+        if not all(-OVERHANG <= corner <= 1 + OVERHANG for corner in corners):
+            raise ValueError(
+                f"{self}: corners must be shares of the image; for boxes that reach beyond it, "
+                "Detection.clipped"
+            )
+        for side, corner in zip(("x1", "y1", "x2", "y2"), _clip(self.label, corners), strict=True):
+            object.__setattr__(self, side, corner)
+
+    @classmethod
+    def clipped(cls, label: str, x1: float, y1: float, x2: float, y2: float) -> Detection:
+        """A detection whose box may reach beyond the image however far; it is clipped to it.
+
+        Raises:
+          ValueError: a corner is not finite, corners are in the wrong order, or the whole box is
+            outside of the image.
+        """
+        return cls(label, *_clip(label, (x1, y1, x2, y2)))
+
+
+def _clip(label: str, corners: tuple[float, ...]) -> tuple[float, ...]:
+    """The part of a box that is inside the image."""
+    x1, y1, x2, y2 = whole = tuple(map(float, corners))
+    if not (all(map(math.isfinite, whole)) and x1 <= x2 and y1 <= y2):
+        raise ValueError(f"{label} at {whole}: corners must be finite, x1 <= x2 and y1 <= y2")
+    left, top, right, bottom = inside = tuple(min(max(corner, 0.0), 1.0) for corner in whole)
+    if (left == right and x1 != x2) or (top == bottom and y1 != y2):
+        raise ValueError(f"{label} at {whole}: the box is outside of the image")
+    return inside
 
 
 class AgentState(NamedTuple):
@@ -80,6 +123,7 @@ class Agent:
         known classes alone; any other model is shown whatever has a name.
       model, weights: the network and its parameters.
       grid: the turns and steps of the world in which it acts, which its sensors must know.
+      labels: what the labels of targets and detections mean to it.
     """
 
     def __init__(
@@ -89,6 +133,7 @@ class Agent:
         vectors: WordVectors,
         classes: ClassVocabulary | None = None,
         grid: PoseGrid = ITHOR,
+        synonyms: Synonyms | Path | str | None = None,
     ) -> None:
         self.config = config
         self.grid = grid
@@ -97,7 +142,8 @@ class Agent:
         self.spec = dataclasses.replace(self.model.spec, grid=grid)
         self.weights = weights
         self._vectors = vectors
-        self._labels = {class_words(name): i for i, name in enumerate(self.classes.names)}
+        self.labels = Labels(self.classes.names, vectors.index, synonyms)
+        self._rows = {class_words(name): i for i, name in enumerate(self.classes.names)}
         self._table: Any = None
         self._decide = jax.jit(self._forward)
 
@@ -140,14 +186,15 @@ class Agent:
         Args:
           state: from `start` or the previous step.
           detections: the objects in view, in any order.
-          target: what to look for, in English.
+          target: what to look for, in English. Detections of it are those whose label means the
+            same (`labels`): "tv", "TVs" and "Television_2" do.
           key: samples the action, as in training; None takes the most probable one.
           blocked: whether the previous action failed to move the agent (AI2-THOR's
             `lastActionSuccess` was False). Networks with sensors need it after a MoveAhead, and
             after no other action.
 
         Raises:
-          KeyError: a label has a word without a word vector.
+          LabelError: a label means nothing known, and has a word without a word vector.
           ValueError: the model needs an image instead of detections; or it has sensors and is not
             told whether its MoveAhead was blocked.
         """
@@ -172,8 +219,12 @@ class Agent:
         return state._replace(action=best[0]), decision
 
     def knows(self, label: str) -> bool:
-        """Whether a label has a word vector, so that it can be detected or looked for."""
-        return not self._vectors.missing([label])
+        """Whether a label has a meaning (`labels`), so that it can be detected or looked for."""
+        try:
+            self.labels.resolve(label)
+        except LabelError:
+            return False
+        return True
 
     def _observe(
         self, detections: Sequence[Detection], target: str
@@ -204,17 +255,16 @@ class Agent:
         return observation, owner
 
     def _index(self, label: str) -> int:
-        """The row of a label in the table of classes; a new label gets a new row."""
-        words = class_words(label)
-        if words not in self._labels:
-            self._vectors.embed(label)  # an unknown word is an error before anything changes
-            self._labels[words] = len(self._labels)
+        """The row in the table of classes of what a label means; new words get a new row."""
+        words = class_words(self.labels.resolve(label))
+        if words not in self._rows:
+            self._rows[words] = len(self._rows)
             self._table = None
-        return self._labels[words]
+        return self._rows[words]
 
     def _prepared(self) -> Any:
         if self._table is None:
-            names = [" ".join(words) for words in self._labels]
+            names = [" ".join(words) for words in self._rows]
             table = self._vectors.table(names, self.config.network.word_norm)
             rest = -len(table) % LABEL_BLOCK
             words = jnp.asarray(np.pad(table, ((0, rest), (0, 0))))
@@ -244,7 +294,9 @@ class Agent:
         return AgentState(recurrent, state.action, sensors, frame.target), out, attention
 
 
-def load(run: Path | str, grid: PoseGrid = ITHOR) -> Agent:
+def load(
+    run: Path | str, grid: PoseGrid = ITHOR, synonyms: Synonyms | Path | str | None = None
+) -> Agent:
     """The agent of a run's newest checkpoint, or of a point of its history. Needs no rooms.
 
     Args:
@@ -257,7 +309,7 @@ def load(run: Path | str, grid: PoseGrid = ITHOR) -> Agent:
     """
     config, weights, classes = read(run)
     vectors = word_vectors.load_word_vectors(config.word_vectors, classes.names)
-    return Agent(config, weights, vectors, classes, grid)
+    return Agent(config, weights, vectors, classes, grid, synonyms)
 
 
 def read(run: Path | str) -> tuple[TrainConfig, Any, ClassVocabulary]:

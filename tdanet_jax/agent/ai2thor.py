@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 
 from tdanet_jax.agent.agent import Agent, Decision, Detection
+from tdanet_jax.labels import Labels
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.vocabulary import (
     ACTION_NAMES,
@@ -23,7 +24,6 @@ from tdanet_jax.vocabulary import (
     IMAGE_SIZE,
     VISIBILITY_DISTANCE,
     Action,
-    class_words,
 )
 
 
@@ -124,12 +124,15 @@ def detections(event: Event) -> list[Detection]:
     ]
 
 
-def is_visible(event: Event, target: str) -> bool:
-    """Whether an object of this type is `visible` in AI2-THOR: in view and within 1.5 m."""
-    words = class_words(target)
+def is_visible(event: Event, target: str, labels: Labels | None = None) -> bool:
+    """Whether an object of this type is `visible` in AI2-THOR: in view and within 1.5 m.
+
+    Args:
+      target: a label that means the type; by default according to the bundled table.
+    """
+    same = (labels or Labels()).same
     return any(
-        item["visible"] and class_words(item["objectType"]) == words
-        for item in event.metadata["objects"]
+        item["visible"] and same(item["objectType"], target) for item in event.metadata["objects"]
     )
 
 
@@ -150,13 +153,14 @@ def play(
     Args:
       controller: made with `SETTINGS` or, for an agent of another grid, `settings(agent.grid)`; its
         agent on the grid, at a multiple of its turn.
-      target: what to look for, in English; for `success`, an object type such as "Laptop".
+      target: what to look for, in English; for `success`, a label that means an object type, such
+        as "laptop".
       key: samples the actions, as in training; None takes the most probable ones.
       step_limit: actions after which the episode ends without success. Test episodes have 100, and
         200 in living rooms.
 
     Raises:
-      KeyError: the target has a word without a word vector.
+      LabelError: the target means nothing known, and has a word without a word vector.
       ValueError: the agent's grid lacks the start's rotation or horizon, or has turns other than 45
         and 90 degrees, along which AI2-THOR's MoveAhead leaves the grid; a frame has no detections;
         an action led to an unexpected pose, as with other settings; or the agent requires an image.
@@ -186,7 +190,7 @@ def play(
         places.append(_place(event))
         if decision.action == Action.DONE:
             break
-    success = decisions[-1].action == Action.DONE and is_visible(event, target)
+    success = decisions[-1].action == Action.DONE and is_visible(event, target, agent.labels)
     return Episode(tuple(decisions), tuple(places), success, frozenset(unnamed))
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.report import EPISODES_FILE
+from tdanet_jax.labels import Labels
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ACTION_NAMES
 
@@ -45,6 +46,7 @@ def find(
     """One episode in a room.
 
     Args:
+      target: a target class, or a label that means it, such as "tv".
       start: by default one is drawn, as for test episodes; in a house, in a room of any type.
       seed: for drawing the start.
 
@@ -57,6 +59,7 @@ def find(
     index = tables.scenes.index(scene)
     within = tables.distance[tables.state_scene == index].max(axis=0, initial=-1) >= 0
     found = sorted(name for name, ok in zip(tables.targets, within, strict=True) if ok)
+    target = Labels(tables.classes).find(target) or target
     if target not in found:
         raise ValueError(
             f"{target}: no target that can be seen in {scene}; there: {', '.join(found) or 'none'}"

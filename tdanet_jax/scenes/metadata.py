@@ -20,7 +20,8 @@ The grid, that is gridSize, rotateStepDegrees and horizons, is the same for all 
 
 The fields objectId, objectType and axisAlignedBoundingBox of an object are required;
 objectOrientedBoundingBox, rotation, openable, isOpen, pickupable, parentReceptacles and visible are
-read if present.
+read if present. An objectType that means a class of AI2-THOR, such as "tv" or "Arm_Chair", is read
+as that class; any other is a class of its own.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -35,6 +37,7 @@ from typing import Any
 
 import numpy as np
 
+from tdanet_jax.labels import ai2thor_class
 from tdanet_jax.poses import ITHOR, TURNS, PoseGrid
 from tdanet_jax.scenes import house
 from tdanet_jax.scenes.room_names import Kinds, RoomKind, check_kind, check_name, known_type
@@ -185,6 +188,11 @@ def read_scenes(path: Path, kinds: Kinds | None = None) -> list[Scene]:
     if unknown := [name for name in kinds.table if name not in names]:
         raise SceneError(f"{path}: no room is called {unknown[0]}, which --rooms lists")
     scenes = [_read_scene(path, document, kinds) for document in documents]
+    given = {record["objectType"] for document in documents for record in document["objects"]}
+    renamed = [f"{name} as {known}" for name in sorted(given) if (known := _known(name)) != name]
+    if renamed:
+        listed = ", ".join(renamed)
+        warnings.warn(f"{path}: objectType read as AI2-THOR's class: {listed}", stacklevel=2)
     name, times = Counter(scene.name for scene in scenes).most_common(1)[0]
     if times > 1:
         raise SceneError(f"{path}: {name}: name occurs {times} times")
@@ -218,7 +226,7 @@ def _read_scene(path: Path, document: Any, kinds: Kinds) -> Scene:
     scene = parse_scene(
         name,
         room_type,
-        document["objects"],
+        [_with_known_class(record) for record in document["objects"]],
         np.reshape(points, (-1, 3)),
         position,
         rotation,
@@ -250,6 +258,18 @@ def _rooms(scene: str, document: Mapping[str, Any]) -> list[house.Room]:
         check_name(record["roomType"], f"{scene}: {name}: roomType")
         rooms.append(house.Room(known_type(record["roomType"]), np.array(corners)[:, [0, 2]]))
     return rooms
+
+
+def _with_known_class(record: Any) -> Any:
+    """An object's record with AI2-THOR's name of its class, so that splits and agents know it."""
+    if not isinstance(record, Mapping) or not isinstance(record.get("objectType"), str):
+        return record
+    return {**record, "objectType": _known(record["objectType"])}
+
+
+def _known(name: str) -> str:
+    """AI2-THOR's class, if a name means one; or else the name."""
+    return ai2thor_class(name) or name
 
 
 def _kind(

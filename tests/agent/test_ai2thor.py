@@ -17,6 +17,7 @@ from tdanet_jax.agent import ai2thor
 from tdanet_jax.agent.agent import Decision, Detection
 from tdanet_jax.analysis import trace
 from tdanet_jax.evaluation import episodes
+from tdanet_jax.labels import Labels
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.vocabulary import TARGETS, Action
 from tests.conftest import TINY, save_untrained
@@ -189,7 +190,7 @@ class Script:
     """An agent that takes the given actions, and remembers what it was shown and told."""
 
     def __init__(self, *actions: Action, grid: poses.PoseGrid = poses.ITHOR) -> None:
-        self.grid = grid
+        self.grid, self.labels = grid, Labels(synonyms={"CoffeeMachine": ["brewing unit"]})
         self.actions, self.seen, self.blocked, self.keys = list(actions), [], [], []
 
     def start(self, rotation, horizon):
@@ -314,10 +315,11 @@ def test_success_is_what_ai2thor_calls_visible(rooms):
     """Whichever way the target is written; and only at Done."""
     goal = rooms.targets.index("CoffeeMachine")
     seen, unseen = (int(np.flatnonzero(rooms.distance[:, goal] == away)[3]) for away in (0, 9))
-    for target in ("CoffeeMachine", "coffee machine"):
+    for target in ("CoffeeMachine", "coffee machine", "Coffeemaker_1", "brewing unit"):
         assert ai2thor.play(StandIn(rooms, seen), Script(DONE), target).success
     assert not ai2thor.play(StandIn(rooms, unseen), Script(DONE), "CoffeeMachine").success
     assert not ai2thor.play(StandIn(rooms, seen), Script(DONE), "machine").success
+    assert ai2thor.is_visible(StandIn(rooms, seen).last_event, "coffee maker")
     limited = ai2thor.play(StandIn(rooms, seen), Script(UP, UP, UP), "CoffeeMachine", step_limit=3)
     assert not limited.success
     assert limited.actions == (UP, UP, UP)

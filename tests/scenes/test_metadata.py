@@ -46,6 +46,21 @@ DOCUMENT: dict[str, Any] = {
 }
 
 
+@pytest.mark.filterwarnings("error")
+def test_classes_go_by_ai2thors_names(tmp_path: Path) -> None:
+    """Or else a split would not hide a Laptop that is called otherwise."""
+    document = copy.deepcopy(DOCUMENT)
+    document["objects"][0]["objectType"] = "laptop_computer"
+    document["objects"][2]["objectType"] = "Oven"
+    with pytest.warns(UserWarning, match=r"scenes\.json: .*: laptop_computer as Laptop$"):
+        [scene] = read(tmp_path, document)
+    assert [item.object_class for item in scene.objects] == ["Laptop", "Oven"]
+    assert scene.objects[0].parents == ("Desk|0",)
+    document["objects"][0]["objectType"] = "AppleSliced"  # another class of AI2-THOR
+    [scene] = read(tmp_path, document)
+    assert [item.object_class for item in scene.objects] == ["AppleSliced", "Oven"]
+
+
 def read(tmp_path: Path, document: Any) -> Any:
     path = tmp_path / "scenes.json"
     path.write_text(document if isinstance(document, str) else json.dumps(document))
