@@ -59,7 +59,7 @@ def show(command: Command) -> None:
     out = command.out or default_folder(command)
     rooms = one_episode.load_rooms(choice, runs)
     tables = rooms.tables
-    player = one_episode.load_players(runs, rooms, choice.policy)[0]
+    player = one_episode.load_players(choice, runs, rooms)[0]
     if not player.attends:
         fail(
             f"--checkpoint {command.checkpoint}: this model has no attention over the detections; "

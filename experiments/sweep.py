@@ -32,7 +32,7 @@ from experiments.console import (
 )
 from experiments.running import Command as TrainingCommand
 from experiments.running import how_to_continue, parse_command, stoppable
-from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
+from tdanet_jax.config import CONFIG_FILE, OWN_TASK, TrainConfig, run_name
 from tdanet_jax.io import files
 from tdanet_jax.splits import file_name
 from tdanet_jax.workflows import sweep, sweep_report
@@ -220,7 +220,7 @@ def costs(runs: Sequence[FinishedRun]) -> dict[str, Cost]:
         config = run.config
         network = config.model, config.network, config.data, config.word_vectors
         if network not in measured:
-            task = load_task(config)
+            task = load_task(OWN_TASK.locate(config, run.folder))
             rows = {batch: benchmarking.decision_row(task, batch, repeats=5) for batch in BATCHES}
             milliseconds = {batch: row["milliseconds"] for batch, row in rows.items()}
             measured[network] = Cost(config.model, rows[BATCHES[0]]["parameters"], milliseconds)

@@ -40,11 +40,11 @@ def check(command: Command) -> TrainConfig:
     config = command.run
     if command.resume is not None:
         given = dataclasses.replace(command, run=TrainConfig(), devices=1, tensorboard=False)
-        budget = TrainConfig().with_budget(config)
-        if given != Command(run=TrainConfig(), resume=command.resume) or config != budget:
+        new = dataclasses.replace(TrainConfig().with_budget(config), data=config.data)
+        if given != Command(run=TrainConfig(), resume=command.resume) or config != new:
             fail(
                 "--resume continues a run as it began: it takes a new budget (--steps, --episodes, "
-                "--minutes), --devices and --tensorboard alone"
+                "--minutes), the new place of its rooms (--data), --devices and --tensorboard alone"
             )
         from tdanet_jax.workflows.train import resumed
 

@@ -22,6 +22,8 @@ DEFAULT_STEPS = 12_000_000
 BUDGETS = ("steps", "episodes", "minutes")
 #: Name of the file in a run's folder that holds its configuration.
 CONFIG_FILE = "config.json"
+#: Name of the file in a run's folder that holds a copy of the vectors of --word-vectors.
+WORD_VECTORS_FILE = "word_vectors.npz"
 #: Environment variable: comma-separated modules of custom models and sensors that a run's config
 #: may import.
 TRUST = "TDANET_TRUST"
@@ -213,6 +215,66 @@ class TrainConfig:
     def steps_per_update(self) -> int:
         """Environment steps in one update."""
         return self.learner.num_envs * self.learner.rollout_steps
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalConfig:
+    """Where an evaluation departs from the run's own task."""
+
+    data: str | None = None
+    """File of rooms that `experiments.scenes import` wrote, instead of the run's or the bundled
+    ones; also the new place of a file that was moved."""
+    word_vectors: str | None = None
+    """File of word vectors, instead of the run's or the bundled ones. A run keeps a copy of the
+    vectors it was trained with, and needs the file only if that lacks the rooms' classes."""
+
+    def locate(self, config: TrainConfig, run: Path) -> TrainConfig:
+        """A run's configuration with the files to evaluate it with.
+
+        Args:
+          config: the run's.
+          run: its folder.
+
+        Raises:
+          ValueError: a file that the run was trained with is not where it was; says how to give its
+            new place.
+        """
+        data = self.data
+        if data is None and config.data is not None:
+            data = config.data
+            if not Path(data).is_file():
+                raise ValueError(
+                    f"{data}: no such file; {run} was trained in these rooms: give the file's "
+                    "place with --data"
+                )
+        words = find_word_vectors(config, run, self.word_vectors)
+        return dataclasses.replace(config, data=data, word_vectors=words)
+
+
+#: An evaluation of a run's own task.
+OWN_TASK = EvalConfig()
+
+
+def find_word_vectors(config: TrainConfig, run: Path, instead: str | None = None) -> str | None:
+    """The file of a run's word vectors; None if they are the bundled ones.
+
+    Args:
+      config: the run's.
+      run: its folder.
+      instead: a file to take in place of the run's own.
+
+    Raises:
+      ValueError: the run holds no copy of them, and the file is not where it was.
+    """
+    if instead is not None or config.word_vectors is None:
+        return instead
+    for path in (run / WORD_VECTORS_FILE, Path(config.word_vectors)):
+        if path.is_file():
+            return str(path)
+    raise ValueError(
+        f"{config.word_vectors}: no such file; {run} was trained with these word vectors and holds "
+        "no copy: give the file's place with --word-vectors"
+    )
 
 
 #: Names of settings, the condition on their values, and how an error states it.

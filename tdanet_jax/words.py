@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tdanet_jax.io import assets
+from tdanet_jax.io import archive, assets, files
 from tdanet_jax.io.untrusted import FileError, hdf5, npz
 from tdanet_jax.vocabulary import class_words
 
@@ -47,9 +47,7 @@ class WordVectors:
         Raises:
           KeyError: a word of the name has no vector; the message names it.
         """
-        words = class_words(name)
-        if " ".join(words) in self.index:
-            words = (" ".join(words),)
+        words = self._keys(name)
         missing = [word for word in words if word not in self.index]
         if missing or not words:
             raise KeyError(f"no word vector for {missing or name!r} in the label {name!r}")
@@ -68,13 +66,40 @@ class WordVectors:
             raise ValueError(f"no word vectors for {', '.join(lacking)}; --word-vectors FILE")
         return np.stack([self.embed(name, norm) for name in names])
 
+    def save_copy(self, path: Path, names: Iterable[str]) -> None:
+        """Writes the vectors of some names exactly, and those of other words in 16 bits.
+
+        Of the other words, those that the bundled file has and the first 20,000 are kept. The file
+        is an npz that `load_word_vectors` reads.
+        """
+        kept = {key for name in names for key in self._keys(name)}
+        exact = {self.index[key] for key in kept if key in self.index}
+        kept |= load_bundled().index.keys()
+        words = [word for i, word in enumerate(self.index) if i < ASSET_WORDS or word in kept]
+        rows = np.array([self.index[word] for word in words])
+        vectors = self.vectors[rows]
+        with np.errstate(over="ignore"):
+            rounded = vectors.astype(np.float16).astype(np.float32)
+        whole = np.isin(rows, [*exact]) | ~np.isfinite(rounded).all(axis=1)
+        arrays = {
+            "words": np.frombuffer("\n".join(words).encode(), np.uint8),
+            "vectors": np.where(whole[:, None], vectors, rounded),  # compresses as 16 bits do
+        }
+        with files.replacing(path) as temporary:
+            archive.write(temporary, arrays, compress=True)
+
+    def _keys(self, name: str) -> tuple[str, ...]:
+        """The entries of the table that make the vector of a name."""
+        words = class_words(name)
+        return (" ".join(words),) if " ".join(words) in self.index else words
+
     def missing(self, names: Iterable[str]) -> list[str]:
         """The names without a vector, each followed by its unknown words."""
         lacking = []
         for name in names:
-            words = class_words(name)
+            words = self._keys(name)
             unknown = [word for word in words if word not in self.index]
-            if " ".join(words) not in self.index and (unknown or not words):
+            if unknown or not words:
                 lacking.append(f"{name} ({', '.join(unknown) or 'no words'})")
         return lacking
 

@@ -105,12 +105,14 @@ def check_empty(folder: Path, instead: str = "") -> None:
 def locked(folder: Path, wait: bool = False) -> Iterator[None]:
     """Holds the lock of a folder, which is created if it does not exist.
 
-    The operating system releases the lock when the process ends, however it ends.
+    The operating system releases the lock when the process ends, however it ends. On an error, a
+    folder that was created for nothing is removed again.
 
     Raises:
       BlockingIOError: another process holds the lock, and `wait` is False.
       OSError: the folder cannot be written.
     """
+    created = [place for place in (folder, *folder.parents) if not place.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK_FILE)
     try:
@@ -119,5 +121,12 @@ def locked(folder: Path, wait: bool = False) -> Iterator[None]:
         raise BlockingIOError(errno.EWOULDBLOCK, "in use by another process", str(folder)) from None
     try:
         yield
+    except BaseException:
+        if created and [path.name for path in folder.iterdir()] == [LOCK_FILE]:
+            (folder / LOCK_FILE).unlink()
+            with contextlib.suppress(OSError):  # another process has come to use them
+                for place in created:
+                    place.rmdir()
+        raise
     finally:
         lock.release()

@@ -112,17 +112,27 @@ def split(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec(AXIS))
 
 
+def check_divides(environments: int, mesh: Mesh, flag: str = "num-envs") -> None:
+    """Raises ValueError unless environments can be divided evenly; says which numbers can be."""
+    size, rest = mesh.size, environments % mesh.size
+    if rest:
+        fewer, more = environments - rest, environments - rest + size
+        divisors = [n for n in range(1, environments + 1) if environments % n == 0]
+        below, above = max(n for n in divisors if n < size), min(n for n in divisors if n > size)
+        raise ValueError(
+            f"--{flag} {environments}: cannot be divided evenly over {size} devices; "
+            f"{' or '.join(str(n) for n in (fewer, more) if n)} environments can be, or "
+            f"{below} or {above} devices"
+        )
+
+
 def layout(state: Any, mesh: Mesh) -> Any:
     """The sharding of each array of a `TrainState`: split if it has a row per environment.
 
     Raises:
       ValueError: the environments cannot be divided evenly.
     """
-    environments = state.bootstrap_only.shape[0]
-    if environments % mesh.size:
-        raise ValueError(
-            f"--num-envs {environments}: must be a multiple of the {mesh.size} devices"
-        )
+    check_divides(state.bootstrap_only.shape[0], mesh)
 
     def place(tree: Any, sharding: NamedSharding) -> Any:
         return jax.tree.map(lambda _: sharding, tree)

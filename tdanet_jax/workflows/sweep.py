@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from tdanet_jax import config as configs
-from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.config import CONFIG_FILE, OWN_TASK, TrainConfig
 from tdanet_jax.evaluation import comparison
 from tdanet_jax.evaluation.comparison import Result
 from tdanet_jax.io import files
@@ -189,5 +189,6 @@ def untrained(runs: Sequence[FinishedRun], seed: int) -> list[Result]:
     """Results of random actions and of the shortest path on the splits of the runs."""
     from tdanet_jax.workflows.evaluate import UNTRAINED, evaluate
 
-    splits = {run.results["split"]: run.config for run in runs}.values()
-    return [evaluate(policy=n, config=config, seed=seed) for config in splits for n in UNTRAINED]
+    splits = {run.results["split"]: run for run in runs}.values()
+    located = [OWN_TASK.locate(run.config, run.folder) for run in splits]
+    return [evaluate(policy=n, config=config, seed=seed) for config in located for n in UNTRAINED]

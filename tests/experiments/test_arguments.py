@@ -66,7 +66,6 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint full --split 18/4", "--split 18/4: a run is evaluated on its own split"),
         ("--policy random --history", "--policy random has no --history"),
         ("--checkpoint full --validation", "--validation: a trained run has its own rooms"),
-        ("--checkpoint full --word-vectors x", "--word-vectors x: a trained run has its own"),
         ("--policy random --word-vectors x.txt", "x.txt: no such file"),
         ("--checkpoint a --checkpoint a", "--checkpoint: a run is given twice"),
         ("--checkpoint a --checkpoint b", "several checkpoints need --out"),
