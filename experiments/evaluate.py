@@ -51,8 +51,8 @@ class Command:
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
-    command = parse(Command, arguments, prog="evaluate")
     with one_line_errors():
+        command = parse(Command, arguments, prog="evaluate")
         trained = command.policy in ("sample", "greedy")
         if trained and not command.checkpoint:
             fail(f"--policy {command.policy} needs --checkpoint")
@@ -74,6 +74,7 @@ def main(arguments: list[str] | None = None) -> None:
             seed=command.seed or 0,
         )
         config.check()
+        command.test.check()
         kind = f"history-{command.policy}" if command.history else command.policy
         folder = command.out or (*command.checkpoint, Path("runs"))[0] / kind
         files.check_empty(folder)
@@ -90,8 +91,11 @@ def play(command: Command, config: TrainConfig, folder: Path) -> None:
     from tdanet_jax.workflows.evaluate import evaluate
 
     devices.keep_compiled()
+    devices.start()
     runs = command.checkpoint
     several = command.history or len(runs) > 1
+    if not several:
+        console.print("playing the test episodes ...")
     with reporter("evaluating") if several else contextlib.nullcontext() as show:
         results = evaluate(
             runs if several else runs[0] if runs else None,

@@ -139,6 +139,7 @@ def play_runs(command: Comparison) -> tuple[list[Trace], SceneTables]:
     from tdanet_jax.training import devices
 
     devices.keep_compiled()
+    devices.start()
     choice, runs = command.choice, command.checkpoint
     rooms = load_rooms(choice, runs)
     players = load_players(choice, runs, rooms)

@@ -33,11 +33,13 @@ class Command:
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
-    command = parse(Command, arguments, prog="share", description=__doc__)
     with one_line_errors():
+        command = parse(Command, arguments, prog="share", description=__doc__)
         files.check_empty(command.out)
         from tdanet_jax.evaluation import saved_networks
+        from tdanet_jax.training import devices
 
+        devices.start()
         saved_networks.share(command.checkpoint, command.out, command.word_vectors)
         size = sum(path.stat().st_size for path in command.out.rglob("*") if path.is_file())
         console.print(f"{size / 1e6:.1f} MB in {command.out}")

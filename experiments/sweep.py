@@ -23,6 +23,7 @@ from pathlib import Path
 import tyro
 
 from experiments.console import (
+    check_folder,
     check_positive,
     console,
     fail,
@@ -32,6 +33,7 @@ from experiments.console import (
 )
 from experiments.running import Command as TrainingCommand
 from experiments.running import how_to_continue, parse_command, stoppable
+from experiments.streams import output_may_break
 from tdanet_jax.config import CONFIG_FILE, OWN_TASK, TrainConfig, run_name
 from tdanet_jax.io import files
 from tdanet_jax.splits import file_name
@@ -104,15 +106,27 @@ def main(arguments: list[str] | None = None) -> None:
         planned = [] if command.report_only else [command.out / run_name(c) for c in configs]
         # Runs that do not fit into one report are refused now, not after hours of training.
         check_alike([*sweep.find(command.out), *included], planned)
-        try:
-            if not command.report_only:
-                train_all(command, training, configs)
-            with stoppable(lambda: "finished evaluations are kept"):
-                write_report(command.out, included)
-        except SystemExit as stop:
-            if isinstance(stop.code, int) and stop.code > SIGNALLED:
-                console.print("run the same command again to continue the sweep")
-            raise
+        check_folder(command.out)
+        with output_may_break():
+            run(command, training, configs, included)
+
+
+def run(
+    command: Command,
+    training: TrainingCommand,
+    configs: Sequence[TrainConfig],
+    included: Sequence[FinishedRun],
+) -> None:
+    """Trains and reports; says how to continue if a signal stops it."""
+    try:
+        if not command.report_only:
+            train_all(command, training, configs)
+        with stoppable(lambda: "finished evaluations are kept"):
+            write_report(command.out, included)
+    except SystemExit as stop:
+        if isinstance(stop.code, int) and stop.code > SIGNALLED:
+            console.print("run the same command again to continue the sweep")
+        raise
 
 
 def train_all(command: Command, training: TrainingCommand, configs: Sequence[TrainConfig]) -> None:

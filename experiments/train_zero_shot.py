@@ -18,6 +18,7 @@ from pathlib import Path
 
 from experiments.console import check_positive, console, fail, one_line_errors
 from experiments.running import Command, how_to_continue, parse_command, stoppable, trust
+from experiments.streams import output_may_break
 from tdanet_jax.config import TrainConfig, run_name
 from tdanet_jax.io import files
 
@@ -32,7 +33,8 @@ def main(arguments: list[str] | None = None) -> None:
         joined = bool(os.environ.get("JAX_COORDINATOR_ADDRESS"))
         if command.resume is None and not joined:
             files.check_empty(folder, f" (to continue there: --resume {folder})")
-        run(command, config, folder)
+        with output_may_break():
+            run(command, config, folder)
 
 
 def check(command: Command) -> TrainConfig:

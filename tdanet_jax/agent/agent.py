@@ -259,9 +259,7 @@ def load(run: Path | str, grid: PoseGrid = ITHOR, word_vectors: Path | str | Non
         missing or of another width.
     """
     config, weights, classes = read(run)
-    path = find_word_vectors(
-        config, folder_of(run), None if word_vectors is None else str(word_vectors)
-    )
+    path = find_word_vectors(config, folder_of(run), word_vectors)
     vectors = words.load_word_vectors(path, classes.names)
     agent = Agent(config, weights, vectors, classes, grid)
     if path is not None:

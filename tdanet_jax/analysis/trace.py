@@ -92,9 +92,7 @@ def load_player(
         maps that the rooms do not have, or it knows classes by index and the rooms have others.
     """
     config, weights, classes = agent.read(run)
-    path = find_word_vectors(
-        config, agent.folder_of(run), None if word_vectors is None else str(word_vectors)
-    )
+    path = find_word_vectors(config, agent.folder_of(run), word_vectors)
     task = task_in(rooms, dataclasses.replace(config, word_vectors=path))
     task.check_known(run, classes.names)
     if path is not None:

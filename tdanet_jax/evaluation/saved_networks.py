@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from tdanet_jax import config as configs
 from tdanet_jax import words
 from tdanet_jax.config import CONFIG_FILE, OWN_TASK, WORD_VECTORS_FILE, EvalConfig, TrainConfig
-from tdanet_jax.evaluation import comparison, episodes, policies, report, rollout
+from tdanet_jax.evaluation import comparison, policies, report, rollout, selection
 from tdanet_jax.evaluation.report import Played
 from tdanet_jax.io import assets
 from tdanet_jax.models import classes
@@ -29,7 +29,8 @@ from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import Checkpoints, is_shared, newest
 from tdanet_jax.training.history import Snapshot
 
-#: Networks in one call, at most; bounds the memory.
+#: Networks in one call on an accelerator, at most; bounds the memory. A CPU plays one after the
+#: other, so there each has a call of its own, and progress can be reported.
 TOGETHER = 20
 
 
@@ -84,7 +85,7 @@ class Evaluated:
 
 
 def find(
-    run: Path, with_history: bool = False, test: EvalConfig | None = None
+    run: Path | str, with_history: bool = False, test: EvalConfig | None = None
 ) -> list[SavedNetwork]:
     """The newest network of a run, or its whole history, oldest first.
 
@@ -96,6 +97,7 @@ def find(
     Raises:
       ValueError: the folder holds no run, or none of its networks.
     """
+    run = Path(run)
     test = test or OWN_TASK
     config = configs.load(run / CONFIG_FILE)
     if with_history:
@@ -127,8 +129,7 @@ def share(run: Path | str, out: Path | str, word_vectors: Path | str | None = No
     run, out = Path(run), Path(out)
     network, vocabulary = find(run)[0], classes.load_vocabulary(run)
     snapshot = network.load()
-    given = None if word_vectors is None else str(word_vectors)
-    path = configs.find_word_vectors(network.config, run, given)
+    path = configs.find_word_vectors(network.config, run, word_vectors)
     vectors = None if path is None else words.load_word_vectors(path, vocabulary.names)
     out.mkdir(parents=True, exist_ok=True)
     history.save(out / history.NETWORK, snapshot, half=True)
@@ -159,10 +160,11 @@ def evaluate(
         groups.setdefault(_task_config(network), []).append(network)
     for members in groups.values():
         task = load_task(members[0].located)
-        lists = episodes.load(task.tables, task.split, task.extras)
+        params, lists = selection.select(task, members[0].test)
         policy = policies.network(task.model, task.words, greedy)
-        for start in range(0, len(members), TOGETHER):
-            part = members[start : start + TOGETHER]
+        together = 1 if jax.default_backend() == "cpu" else TOGETHER
+        for start in range(0, len(members), together):
+            part = members[start : start + together]
             snapshots = [_checked(network, task) for network in part]
             weights = jax.tree.map(
                 lambda *leaves: jnp.stack(leaves), *(s.weights for s in snapshots)
@@ -170,9 +172,7 @@ def evaluate(
             seeds = [network.config.seed if seed is None else seed for network in part]
             # In parallel, adaptive networks would take their inner steps in every step.
             batched = False if isinstance(task.model, AdaptiveActorCritic) else None
-            played = rollout.evaluate_stacked(
-                policy, weights, task.eval_params, lists, seeds, batched
-            )
+            played = rollout.evaluate_stacked(policy, weights, params, lists, seeds, batched)
             for network, snapshot, own, drawn in zip(part, snapshots, played, seeds, strict=True):
                 yield Evaluated(
                     saved=network,
@@ -185,6 +185,7 @@ def evaluate(
                         drawn,
                         snapshot.episodes,
                         snapshot.updates,
+                        network.test.departures,
                     ),
                     played=own,
                 )

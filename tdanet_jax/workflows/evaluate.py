@@ -10,7 +10,7 @@ from typing import Any
 
 from tdanet_jax.analysis import figures
 from tdanet_jax.config import OWN_TASK, EvalConfig, TrainConfig
-from tdanet_jax.evaluation import comparison, episodes, policies, report, rollout, saved_networks
+from tdanet_jax.evaluation import comparison, policies, report, rollout, saved_networks, selection
 from tdanet_jax.evaluation.policies import Policy
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
 from tdanet_jax.io import files
@@ -50,7 +50,8 @@ def evaluate(
         ended with, and `config.seed` without a run.
       out: folder to write: `results.json`, `results.md` and `episodes.jsonl` for one network,
         `evaluations.json`, `evaluations.md` and `episodes.jsonl` for several; None writes nothing.
-      on_network: called with the share of the networks that are done, and the last one's name.
+      on_network: for several networks, called with the share of them that is done and the name of
+        the last; before the first, with 0 and their number.
 
     Returns:
       The content of `results.json` for one network or policy, a list of them for several.
@@ -60,7 +61,10 @@ def evaluate(
         together.
     """
     folder = None if out is None else Path(out)
+    if folder is not None:
+        files.check_writable(folder)
     test = test or OWN_TASK
+    test.check()
     if data is not None:
         test = dataclasses.replace(test, data=data)
     if checkpoint is None:
@@ -75,6 +79,8 @@ def evaluate(
         done = next(evaluated)
         return report.results(done.provenance, done.task.tables, done.played, folder)
     results, records, columns = {}, [], {}
+    if on_network is not None:
+        on_network(0.0, f"{len(networks)} networks")
     for done in evaluated:
         results[done.saved] = done.results()
         if not history:
@@ -110,9 +116,9 @@ def _evaluate_policy(
     chosen: dict[str, Any] = {name: path for name, path in files.items() if path is not None}
     config = dataclasses.replace(config, **chosen)
     task, seed = load_task(config), config.seed if seed is None else seed
-    lists = episodes.load(task.tables, task.split, task.extras)
-    played = rollout.evaluate_lists(policy, None, task.eval_params, lists, seed)
-    provenance = report.Provenance.of(task, config, name, seed)
+    params, lists = selection.select(task, test)
+    played = rollout.evaluate_lists(policy, None, params, lists, seed)
+    provenance = report.Provenance.of(task, config, name, seed, departures=test.departures)
     return report.results(provenance, task.tables, played, folder)
 
 
@@ -142,10 +148,11 @@ def _write(
     files.write_text(folder / "evaluations.json", json.dumps(results, indent=2) + "\n")
 
 
-def short_names(runs: Sequence[Path]) -> dict[Path, str]:
+def short_names(runs: Sequence[Path | str]) -> dict[Path, str]:
     """A name for each run: its folder's, or the whole path if two folders have the same name."""
-    last = [run.resolve().name for run in runs]
+    paths = [Path(run) for run in runs]
+    last = [path.resolve().name for path in paths]
     return {
         run: name if last.count(name) == 1 else str(run)
-        for run, name in zip(runs, last, strict=True)
+        for run, name in zip(paths, last, strict=True)
     }

@@ -86,18 +86,19 @@ def train(
         return _report(run, lists, callbacks) if finished and devices.is_lead() else None
 
 
-def train_together(members: Sequence[tuple[TrainConfig, Path]], callbacks: Callbacks) -> None:
+def train_together(members: Sequence[tuple[TrainConfig, Path | str]], callbacks: Callbacks) -> None:
     """Trains seeds of one configuration in one vmapped call, and reports on each.
 
     Args:
       members: configurations that differ in their seed alone, and their folders, new or begun.
       callbacks: progress, and a way to stop.
     """
+    pairs = [(config, Path(folder)) for config, folder in members]
     with contextlib.ExitStack() as locks:
-        task = load_task(_located(*members[0]), callbacks.on_rooms)
+        task = load_task(_located(*pairs[0]), callbacks.on_rooms)
         lists = episodes.load(task.tables, task.split, task.extras)
         runs = []
-        for config, folder in members:
+        for config, folder in pairs:
             locks.enter_context(files.locked(folder))
             if not (folder / CONFIG_FILE).exists():
                 _check_new(folder)
@@ -109,12 +110,13 @@ def train_together(members: Sequence[tuple[TrainConfig, Path]], callbacks: Callb
                 _report(run, lists, callbacks)
 
 
-def resumed(folder: Path, new: TrainConfig | None = None) -> TrainConfig:
+def resumed(folder: Path | str, new: TrainConfig | None = None) -> TrainConfig:
     """The configuration of the run in a folder, with the budget and the rooms of another if any.
 
     Raises:
       ValueError: the folder holds no run, or nothing to continue from.
     """
+    folder = Path(folder)
     config = configs.load(folder / CONFIG_FILE)
     if checkpoint.is_shared(folder):
         raise ValueError(f"--resume {folder}: a shared agent; there is nothing to continue from")
