@@ -6,6 +6,7 @@ import contextlib
 import datetime
 import io
 import itertools
+import logging
 import math
 import re
 import sys
@@ -114,6 +115,8 @@ def one_line_errors() -> Iterator[None]:
     """Reduces warnings, user errors (ValueError, OSError) and signals to one line each."""
     with warnings.catch_warnings(), StopRequest().receiving():
         warnings.showwarning = _show_warning  # type: ignore[assignment]
+        # Without a home, Matplotlib would add its own long warning to the one about our cache.
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
         try:
             with ends_with_its_reader():
                 yield

@@ -122,8 +122,10 @@ def test_a_run_leaves_its_machine(
     assert tdanet_jax.load(away).knows("yesterday")  # a word of no class
     with pytest.raises(ValueError, match=r"rooms.npz: no such file; .*with --data$"):
         tdanet_jax.evaluate(away)
-    results = tdanet_jax.evaluate(away, test=EvalConfig(data=str(rooms)))
+    test_rooms = ("FloorPlan29", "FloorPlan229", "FloorPlan321", "FloorPlan428")  # all of them
+    results = tdanet_jax.evaluate(away, test=EvalConfig(data=str(rooms), scenes=test_rooms))
     assert (results["seen"]["L>=1"]["n"], results["data"]) == (100, str(rooms))
+    assert results["departures"] == {"scenes": [*test_rooms]}
     player = trace.load_player(away, dataset.load_rooms(rooms))
     assert player.task.vectors.vectors.shape[1] == 50
     saved_networks.share(away, tmp_path / "again")  # and on from there
