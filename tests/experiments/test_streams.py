@@ -35,6 +35,12 @@ class Broken(io.StringIO):
             raise OSError(self.number, os.strerror(self.number))  # EPIPE: BrokenPipeError
 
 
+@pytest.fixture(autouse=True)
+def own_console(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A console that keeps nothing of what could not be written."""
+    monkeypatch.setattr(console, "console", console.OurConsole(soft_wrap=True))
+
+
 @pytest.fixture
 def hang_up() -> Iterator[None]:
     """Puts the handler of SIGHUP back that a failed test may leave."""
@@ -98,7 +104,7 @@ def test_training_goes_on_without_its_output(
                 console.console.print(f"line {i}")
                 os.kill(os.getpid(), signal.SIGHUP)  # as of a terminal that was closed
                 done.append(i)
-        monkeypatch.undo()
+        monkeypatch.setattr(sys, "stdout", sys.__stdout__)
     assert done == [0, 1, 2]
     assert out.getvalue() == "line 0\n"
     [line] = capsys.readouterr().err.splitlines()
