@@ -1,7 +1,7 @@
 """The training command, as a user types it."""
 
-import errno
 import json
+import os
 import re
 import signal
 import socket
@@ -16,7 +16,6 @@ from experiments import evaluate, train_zero_shot
 from tdanet_jax.io import files
 from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.workflows import train as training
-from tests.experiments.test_streams import Broken
 from tests.support import command
 
 WRITTEN = {
@@ -78,9 +77,11 @@ def test_a_split_of_ones_own_is_trained_evaluated_and_gone_on_with(
 ):
     monkeypatch.chdir(tmp_path)
     arguments = ["--split", "towel,mug,CD", "--steps", "4e2", "--precision", "float32"]
-    with monkeypatch.context() as patch:
+    reader, writer = os.pipe()
+    os.close(reader)  # as `| head` does
+    with monkeypatch.context() as patch, os.fdopen(writer, "w") as broken:
         patch.setattr(training, "_report", lambda *_: None)  # to save time
-        patch.setattr(sys, "stdout", Broken(errno.EPIPE, lines=1))  # as by `| head -1`
+        patch.setattr(sys, "stdout", broken)
         train_zero_shot.main([*arguments, *command.TINY])
     assert "output cannot be written (Broken pipe)" in capsys.readouterr().err
     [run] = (tmp_path / "runs").iterdir()
