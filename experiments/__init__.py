@@ -25,6 +25,9 @@ def _leave() -> None:
 
 
 if sys.argv[0] == "-m":
+    # Where output is closed (>&-), it goes nowhere; libraries expect that it is there.
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     # A command starts here. Until `console.one_line_errors` there is nothing to clean up after a
     # signal: Ctrl-C acts at once, as SIGTERM does.
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:

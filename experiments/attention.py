@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from experiments import one_episode
-from experiments.console import console, fail, one_line_errors, parse
+from experiments.console import check_folder, console, fail, one_line_errors, parse
 from experiments.one_episode import Choice
 
 if TYPE_CHECKING:
@@ -43,9 +43,10 @@ class Command:
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
-    command = parse(Command, arguments, prog="attention", description=__doc__)
     with one_line_errors():
+        command = parse(Command, arguments, prog="attention", description=__doc__)
         one_episode.check(command.choice, [command.checkpoint], required=False)
+        check_folder(command.out or default_folder(command))
         show(command)
 
 
@@ -55,11 +56,12 @@ def show(command: Command) -> None:
     from tdanet_jax.training import devices
 
     devices.keep_compiled()
+    devices.start()
     choice, runs = command.choice, [command.checkpoint]
     out = command.out or default_folder(command)
     rooms = one_episode.load_rooms(choice, runs)
     tables = rooms.tables
-    player = one_episode.load_players(runs, rooms, choice.policy)[0]
+    player = one_episode.load_players(choice, runs, rooms)[0]
     if not player.attends:
         fail(
             f"--checkpoint {command.checkpoint}: this model has no attention over the detections; "

@@ -30,6 +30,8 @@ from experiments.console import check_positive, console, fail, one_line_errors, 
 from tdanet_jax.config import NetworkConfig, TrainConfig
 
 if TYPE_CHECKING:
+    from jax.sharding import Mesh
+
     from tdanet_jax.task import Task
     from tdanet_jax.tools.benchmarking import Row
 
@@ -82,8 +84,8 @@ class Command:
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
-    command = parse(Command, arguments, prog="benchmark")
     with one_line_errors():
+        command = parse(Command, arguments, prog="benchmark")
         if command.out is not None and command.out.exists():
             fail(f"--out {command.out}: exists")
         check_positive(
@@ -101,9 +103,15 @@ def main(arguments: list[str] | None = None) -> None:
             from tdanet_jax.evaluation import saved_networks
 
             saved_networks.find(command.checkpoint)  # an error shows now, not after minutes
+        from tdanet_jax.training import devices
+
+        mesh = devices.connect(command.devices)
+        if "environment" in command.parts:
+            for count in command.environments:
+                devices.check_divides(count, mesh, "environments")
         rows = []
         with contextlib.nullcontext() if command.out is None else command.out.open("x") as file:
-            for row in measure(command):
+            for row in measure(command, mesh):
                 rows.append(row)
                 line = json.dumps(row)
                 console.print(line)
@@ -113,15 +121,17 @@ def main(arguments: list[str] | None = None) -> None:
         console.print(as_table(rows))
 
 
-def measure(command: Command) -> Iterator[Row]:
-    """All results that were asked for, one row each."""
+def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
+    """All results that were asked for, one row each.
+
+    Args:
+      mesh: the devices that environments are split over.
+    """
     import jax
 
     from tdanet_jax.task import load_task
     from tdanet_jax.tools import benchmarking
-    from tdanet_jax.training import devices
 
-    mesh = devices.connect(command.devices)
     machine = {"processor": benchmarking.processor(), "jax": jax.__version__}
     yield {"part": "start", "device": str(jax.devices()[0]), **machine}
     if "tables" in command.parts:

@@ -6,6 +6,9 @@ import contextlib
 import datetime
 import io
 import itertools
+import logging
+import math
+import re
 import sys
 import time
 import warnings
@@ -18,6 +21,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from experiments.signals import Stopped, StopRequest
+from experiments.streams import ends_with_its_reader
+from tdanet_jax.io import files
 from tdanet_jax.splits import GROUPS
 
 Arguments = TypeVar("Arguments")
@@ -25,13 +30,23 @@ Arguments = TypeVar("Arguments")
 #: Without a terminal, progress is a line at most this often.
 SECONDS_BETWEEN_LINES = 10.0
 
+
+class OurConsole(Console):
+    """A console that leaves it to us what happens when a pipe breaks."""
+
+    def on_broken_pipe(self) -> None:
+        """Raises the error on, in place of ending the program."""
+        raise
+
+
 #: Without markup: names from files may hold brackets.
-console = Console(stderr=False, highlight=False, soft_wrap=True, markup=False)
+console = OurConsole(stderr=False, highlight=False, soft_wrap=True, markup=False)
 
 
 def fail(message: object) -> NoReturn:
     """Ends the program with one line on standard error and exit status 2."""
-    print(f"error: {message}", file=sys.stderr)
+    with contextlib.suppress(BrokenPipeError):
+        print(f"error: {message}", file=sys.stderr)
     raise SystemExit(2)
 
 
@@ -40,7 +55,7 @@ def one_line_usage() -> Iterator[None]:
     """Reduces tyro's boxed usage error to its first paragraph, on one line."""
     said = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(said), _registry:
             yield
     except SystemExit as stop:
         if not stop.code:
@@ -55,6 +70,40 @@ def _is_rule(line: str) -> bool:
     return line.startswith(("─", "---"))
 
 
+_registry = tyro.constructors.ConstructorRegistry()
+
+
+@_registry.primitive_rule
+def _whole_numbers(
+    kind: tyro.constructors.PrimitiveTypeInfo,
+) -> tyro.constructors.PrimitiveConstructorSpec[int] | None:
+    """How an integer flag is read."""
+    if kind.type is not int:
+        return None
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=lambda words: whole_number(words[0]),
+        is_instance=lambda value: isinstance(value, int),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def whole_number(text: str) -> int:
+    """An integer as people type it: 1000000, 1_000_000, 1e6, 1.5e6.
+
+    Raises:
+      ValueError: it is none.
+    """
+    try:
+        return int(text)
+    except ValueError:
+        number = float(text) if re.fullmatch(r"[\d.]+e\+?\d\d?", text.lower()) else math.nan
+        if not number.is_integer():
+            raise
+        return int(number)
+
+
 def parse(command: type[Arguments], arguments: Sequence[str] | None, **options: Any) -> Arguments:
     """`tyro.cli`, with errors in one line."""
     with one_line_usage():
@@ -66,8 +115,11 @@ def one_line_errors() -> Iterator[None]:
     """Reduces warnings, user errors (ValueError, OSError) and signals to one line each."""
     with warnings.catch_warnings(), StopRequest().receiving():
         warnings.showwarning = _show_warning  # type: ignore[assignment]
+        # Without a home, Matplotlib would add its own long warning to the one about our cache.
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
         try:
-            yield
+            with ends_with_its_reader():
+                yield
         except OSError as error:
             fail(f"{error.filename}: {error.strerror}" if error.filename else error)
         except ValueError as error:
@@ -90,14 +142,30 @@ def check_new_file(path: Path, in_folder: bool = True) -> None:
         fail(f"--out {path}: exists")
     if in_folder and not path.absolute().parent.is_dir():
         fail(f"--out {path}: no such folder")
+    files.check_writable(path)
 
 
 def check_picture(out: Path) -> None:
-    """Fails unless --out ends in a picture format."""
+    """Fails unless --out ends in a picture format and can be written."""
     from tdanet_jax.analysis import drawing
 
     if out.suffix[1:] not in drawing.formats():
         fail(f"--out {out}: end it in one of .{', .'.join(drawing.formats())}")
+    check_file(out)
+
+
+def check_file(out: Path) -> None:
+    """Fails unless a file can be written at --out; an existing one will be replaced."""
+    if out.is_dir():
+        fail(f"--out {out}: is a folder")
+    files.check_writable(out)
+
+
+def check_folder(out: Path) -> None:
+    """Fails unless files can be written into the folder --out; there may be others in it."""
+    if out.exists() and not out.is_dir():
+        fail(f"--out {out}: is a file")
+    files.check_writable(out)
 
 
 def check_at_most(flag: str, value: int, most: int) -> None:
@@ -164,8 +232,11 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
 
 def print_summary(results: Mapping[str, Any]) -> None:
     """One line per group: seen targets, 1000 episodes: SR 75.1 (70.2 to 80.0), SPL ..."""
+    from tdanet_jax.config import describe_departures
     from tdanet_jax.evaluation.metrics import shown
 
+    if results.get("departures"):
+        console.print(describe_departures(results["departures"]))
     for group in GROUPS:
         if results[group] is None:
             continue

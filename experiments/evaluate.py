@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 import tyro
 
 from experiments.console import console, fail, one_line_errors, parse, print_summary, reporter
-from tdanet_jax.config import TrainConfig
+from tdanet_jax.config import OWN_TASK, EvalConfig, TrainConfig
 from tdanet_jax.io import files
 
 
@@ -40,12 +40,7 @@ class Command:
     """Split for policies that need no checkpoint; by default 18/4. A run has its own."""
     validation: bool = False
     """Evaluate policies that need no checkpoint on the validation episodes."""
-    data: str | None = None
-    """File of rooms that `experiments.scenes import` wrote, instead of the run's or the bundled
-    ones."""
-    word_vectors: str | None = None
-    """File of word vectors for policies that need no checkpoint, if the rooms hold classes that the
-    bundled vectors lack. A run has its own."""
+    test: tyro.conf.OmitArgPrefixes[EvalConfig] = OWN_TASK
     seed: int | None = None
     """Seed of sampled actions. By default the run's own, which gives the results that its training
     ended with; 0 for the policies that need no checkpoint."""
@@ -56,8 +51,8 @@ class Command:
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
-    command = parse(Command, arguments, prog="evaluate")
     with one_line_errors():
+        command = parse(Command, arguments, prog="evaluate")
         trained = command.policy in ("sample", "greedy")
         if trained and not command.checkpoint:
             fail(f"--policy {command.policy} needs --checkpoint")
@@ -69,8 +64,6 @@ def main(arguments: list[str] | None = None) -> None:
             fail(f"--split {command.split}: a run is evaluated on its own split")
         if trained and command.validation:
             fail("--validation: a trained run has its own rooms and classes")
-        if trained and command.word_vectors is not None:
-            fail(f"--word-vectors {command.word_vectors}: a trained run has its own")
         if len(set(command.checkpoint)) < len(command.checkpoint):
             fail("--checkpoint: a run is given twice")
         if len(command.checkpoint) > 1 and command.out is None:
@@ -78,11 +71,10 @@ def main(arguments: list[str] | None = None) -> None:
         config = TrainConfig(
             split=TrainConfig().split if command.split is None else command.split,
             validation=command.validation,
-            data=command.data,
-            word_vectors=command.word_vectors,
             seed=command.seed or 0,
         )
         config.check()
+        command.test.check()
         kind = f"history-{command.policy}" if command.history else command.policy
         folder = command.out or (*command.checkpoint, Path("runs"))[0] / kind
         files.check_empty(folder)
@@ -99,15 +91,18 @@ def play(command: Command, config: TrainConfig, folder: Path) -> None:
     from tdanet_jax.workflows.evaluate import evaluate
 
     devices.keep_compiled()
+    devices.start()
     runs = command.checkpoint
     several = command.history or len(runs) > 1
+    if not several:
+        console.print("playing the test episodes ...")
     with reporter("evaluating") if several else contextlib.nullcontext() as show:
         results = evaluate(
             runs if several else runs[0] if runs else None,
             command.policy,
             config=config,
             history=command.history,
-            data=command.data,
+            test=command.test,
             seed=command.seed,
             out=folder,
             on_network=show,

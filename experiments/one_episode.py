@@ -12,7 +12,7 @@ import tyro
 
 from experiments.console import console, fail, reporter
 from tdanet_jax import config as configs
-from tdanet_jax.config import CONFIG_FILE
+from tdanet_jax.config import CONFIG_FILE, EvalConfig
 from tdanet_jax.poses import TURNS
 
 if TYPE_CHECKING:
@@ -39,6 +39,8 @@ class Choice:
     """Seed for drawing the start and sampling actions."""
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote; by default, the first run's rooms."""
+    word_vectors: str | None = None
+    """File of word vectors, instead of the copies that the runs hold of their own."""
     policy: Literal["sample", "greedy"] = "sample"
     """Whether actions are sampled or the most probable ones are taken."""
 
@@ -92,16 +94,19 @@ def load_rooms(choice: Choice, runs: Sequence[Path]) -> Rooms:
     """The rooms of --data or of the first run; shows progress if they are rebuilt."""
     from tdanet_jax.scenes import dataset
 
-    data = choice.data or configs.load(folder_of(runs[0]) / CONFIG_FILE).data
+    run = folder_of(runs[0])
+    files = EvalConfig(data=choice.data, word_vectors=choice.word_vectors)
+    data = files.locate(configs.load(run / CONFIG_FILE), run).data
     with reporter("rooms", transient=True) as report:
         return dataset.load_rooms(data, lambda done, total: report(done / total, "rebuilt"))
 
 
-def load_players(runs: Sequence[Path], rooms: Rooms, policy: str) -> list[Player]:
+def load_players(choice: Choice, runs: Sequence[Path], rooms: Rooms) -> list[Player]:
     """The agents of some runs, by different names."""
     from tdanet_jax.analysis import trace
 
-    players = [trace.load_player(run, rooms, policy == "greedy") for run in runs]
+    greedy, words = choice.policy == "greedy", choice.word_vectors
+    players = [trace.load_player(run, rooms, greedy, words) for run in runs]
     names = [player.name for player in players]
     return [
         player if names.count(player.name) == 1 else dataclasses.replace(player, name=str(run))
@@ -134,9 +139,10 @@ def play_runs(command: Comparison) -> tuple[list[Trace], SceneTables]:
     from tdanet_jax.training import devices
 
     devices.keep_compiled()
+    devices.start()
     choice, runs = command.choice, command.checkpoint
     rooms = load_rooms(choice, runs)
-    players = load_players(runs, rooms, choice.policy)
+    players = load_players(choice, runs, rooms)
     if command.shortest:
         players.append(trace.Player("shortest path", players[0].task))
     return play(choice, runs, players, rooms.tables), rooms.tables

@@ -12,7 +12,7 @@ import dataclasses
 from pathlib import Path
 
 from experiments import one_episode
-from experiments.console import one_line_errors, parse
+from experiments.console import check_file, one_line_errors, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +25,10 @@ class Command(one_episode.Comparison):
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
-    command = parse(Command, arguments, prog="replay", description=__doc__)
     with one_line_errors():
+        command = parse(Command, arguments, prog="replay", description=__doc__)
         one_episode.check(command.choice, command.checkpoint)
+        check_file(command.out)
         from tdanet_jax.analysis import replay
         from tdanet_jax.io import files
 

@@ -35,8 +35,9 @@ class Command:
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""
     resume: Path | None = None
-    """Folder of a run to continue. Accepts only --devices, --tensorboard and a new budget, which
-    replaces the run's; its schedules then follow the new one."""
+    """Folder of a run to continue. Accepts only --devices, --tensorboard, --data where the run's
+    rooms were moved to, and a new budget, which replaces the run's; its schedules then follow the
+    new one."""
     tensorboard: bool = False
     """Also write TensorBoard events (needs tensorboardX)."""
     devices: int = 1

@@ -53,8 +53,8 @@ class Command:
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
-    command = parse(Command, arguments, prog="scaling")
     with one_line_errors():
+        command = parse(Command, arguments, prog="scaling")
         files.check_empty(command.out)
         check_positive(
             environments=command.environments,
@@ -71,7 +71,9 @@ def scale(command: Command) -> None:
     from tdanet_jax import scenes, words
     from tdanet_jax.analysis import figures
     from tdanet_jax.task import make_task
+    from tdanet_jax.training import devices
 
+    devices.start()
     task = make_task(TrainConfig(), scenes.load_tables(), words.load_bundled())
     sizes = ("environments", "rooms", "classes", "detections")
     total = sum(len(getattr(command, size)) for size in sizes)

@@ -22,6 +22,7 @@ import tyro
 
 from experiments.console import (
     check_at_most,
+    check_folder,
     check_new_file,
     check_picture,
     check_positive,
@@ -53,6 +54,7 @@ class Build:
 
     def run(self) -> None:
         """Writes the files and lists them."""
+        check_folder(self.out)
         from tdanet_jax.tools import build_assets
 
         for path in build_assets.build(self.out, self.wheels):
@@ -130,6 +132,7 @@ class Inspect:
             state = pictures.most_telling_state(tables)
         else:
             state = tables.nearest_state(0, *self.position, self.rotation, self.horizon)
+        self.out.parent.mkdir(parents=True, exist_ok=True)
         pictures.room(room, tables, state, self.out)
         console.print(f"{self.out}")
 

@@ -23,6 +23,7 @@ from pathlib import Path
 import tyro
 
 from experiments.console import (
+    check_folder,
     check_positive,
     console,
     fail,
@@ -32,7 +33,8 @@ from experiments.console import (
 )
 from experiments.running import Command as TrainingCommand
 from experiments.running import how_to_continue, parse_command, stoppable
-from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
+from experiments.streams import output_may_break
+from tdanet_jax.config import CONFIG_FILE, OWN_TASK, TrainConfig, run_name
 from tdanet_jax.io import files
 from tdanet_jax.splits import file_name
 from tdanet_jax.workflows import sweep, sweep_report
@@ -104,15 +106,27 @@ def main(arguments: list[str] | None = None) -> None:
         planned = [] if command.report_only else [command.out / run_name(c) for c in configs]
         # Runs that do not fit into one report are refused now, not after hours of training.
         check_alike([*sweep.find(command.out), *included], planned)
-        try:
-            if not command.report_only:
-                train_all(command, training, configs)
-            with stoppable(lambda: "finished evaluations are kept"):
-                write_report(command.out, included)
-        except SystemExit as stop:
-            if isinstance(stop.code, int) and stop.code > SIGNALLED:
-                console.print("run the same command again to continue the sweep")
-            raise
+        check_folder(command.out)
+        with output_may_break():
+            run(command, training, configs, included)
+
+
+def run(
+    command: Command,
+    training: TrainingCommand,
+    configs: Sequence[TrainConfig],
+    included: Sequence[FinishedRun],
+) -> None:
+    """Trains and reports; says how to continue if a signal stops it."""
+    try:
+        if not command.report_only:
+            train_all(command, training, configs)
+        with stoppable(lambda: "finished evaluations are kept"):
+            write_report(command.out, included)
+    except SystemExit as stop:
+        if isinstance(stop.code, int) and stop.code > SIGNALLED:
+            console.print("run the same command again to continue the sweep")
+        raise
 
 
 def train_all(command: Command, training: TrainingCommand, configs: Sequence[TrainConfig]) -> None:
@@ -220,7 +234,7 @@ def costs(runs: Sequence[FinishedRun]) -> dict[str, Cost]:
         config = run.config
         network = config.model, config.network, config.data, config.word_vectors
         if network not in measured:
-            task = load_task(config)
+            task = load_task(OWN_TASK.locate(config, run.folder))
             rows = {batch: benchmarking.decision_row(task, batch, repeats=5) for batch in BATCHES}
             milliseconds = {batch: row["milliseconds"] for batch, row in rows.items()}
             measured[network] = Cost(config.model, rows[BATCHES[0]]["parameters"], milliseconds)

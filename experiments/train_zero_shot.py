@@ -18,6 +18,7 @@ from pathlib import Path
 
 from experiments.console import check_positive, console, fail, one_line_errors
 from experiments.running import Command, how_to_continue, parse_command, stoppable, trust
+from experiments.streams import output_may_break
 from tdanet_jax.config import TrainConfig, run_name
 from tdanet_jax.io import files
 
@@ -32,7 +33,8 @@ def main(arguments: list[str] | None = None) -> None:
         joined = bool(os.environ.get("JAX_COORDINATOR_ADDRESS"))
         if command.resume is None and not joined:
             files.check_empty(folder, f" (to continue there: --resume {folder})")
-        run(command, config, folder)
+        with output_may_break():
+            run(command, config, folder)
 
 
 def check(command: Command) -> TrainConfig:
@@ -40,11 +42,11 @@ def check(command: Command) -> TrainConfig:
     config = command.run
     if command.resume is not None:
         given = dataclasses.replace(command, run=TrainConfig(), devices=1, tensorboard=False)
-        budget = TrainConfig().with_budget(config)
-        if given != Command(run=TrainConfig(), resume=command.resume) or config != budget:
+        new = dataclasses.replace(TrainConfig().with_budget(config), data=config.data)
+        if given != Command(run=TrainConfig(), resume=command.resume) or config != new:
             fail(
                 "--resume continues a run as it began: it takes a new budget (--steps, --episodes, "
-                "--minutes), --devices and --tensorboard alone"
+                "--minutes), the new place of its rooms (--data), --devices and --tensorboard alone"
             )
         from tdanet_jax.workflows.train import resumed
 

@@ -13,7 +13,7 @@ import dataclasses
 from pathlib import Path
 
 from experiments import one_episode
-from experiments.console import check_picture, one_line_errors, parse
+from experiments.console import check_file, check_picture, one_line_errors, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,15 +26,14 @@ class Command(one_episode.Comparison):
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
-    command = parse(Command, arguments, prog="trajectories", description=__doc__)
     with one_line_errors():
+        command = parse(Command, arguments, prog="trajectories", description=__doc__)
         one_episode.check(command.choice, command.checkpoint)
         from tdanet_jax.analysis import pictures
         from tdanet_jax.scenes import floor_plan
 
         animated = command.out.suffix == ".gif"
-        if not animated:
-            check_picture(command.out)
+        (check_file if animated else check_picture)(command.out)
         traces, tables = one_episode.play_runs(command)
         plan = floor_plan.of_room(tables, traces[0].scene)
         command.out.parent.mkdir(parents=True, exist_ok=True)

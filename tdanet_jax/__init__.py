@@ -13,7 +13,7 @@ from tdanet_jax import _moved
 
 if TYPE_CHECKING:
     from tdanet_jax.agent import Agent, Decision, Detection, load
-    from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+    from tdanet_jax.config import EvalConfig, LearnerConfig, NetworkConfig, TrainConfig
     from tdanet_jax.task import make
     from tdanet_jax.training.callbacks import Callbacks
     from tdanet_jax.workflows.evaluate import evaluate
@@ -27,6 +27,7 @@ _PUBLIC = {
     "Callbacks": "training.callbacks",
     "Decision": "agent",
     "Detection": "agent",
+    "EvalConfig": "config",
     "LearnerConfig": "config",
     "NetworkConfig": "config",
     "TrainConfig": "config",
@@ -41,6 +42,7 @@ __all__ = [
     "Callbacks",
     "Decision",
     "Detection",
+    "EvalConfig",
     "LearnerConfig",
     "NetworkConfig",
     "TrainConfig",

@@ -22,6 +22,8 @@ DEFAULT_STEPS = 12_000_000
 BUDGETS = ("steps", "episodes", "minutes")
 #: Name of the file in a run's folder that holds its configuration.
 CONFIG_FILE = "config.json"
+#: Name of the file in a run's folder that holds a copy of the vectors of --word-vectors.
+WORD_VECTORS_FILE = "word_vectors.npz"
 #: Environment variable: comma-separated modules of custom models and sensors that a run's config
 #: may import.
 TRUST = "TDANET_TRUST"
@@ -215,6 +217,107 @@ class TrainConfig:
         return self.learner.num_envs * self.learner.rollout_steps
 
 
+@dataclasses.dataclass(frozen=True)
+class EvalConfig:
+    """Where an evaluation departs from the run's own task."""
+
+    data: str | None = None
+    """File of rooms that `experiments.scenes import` wrote, instead of the run's or the bundled
+    ones; also the new place of a file that was moved."""
+    word_vectors: str | None = None
+    """File of word vectors, instead of the run's or the bundled ones. A run keeps a copy of the
+    vectors it was trained with, and needs the file only if that lacks the rooms' classes."""
+    step_limit: int | None = None
+    """Actions after which an episode ends, instead of the test's limits for each room type."""
+    episodes: int | None = None
+    """Play at most this many episodes of each list, evenly spaced, for a quick look."""
+    scenes: tuple[str, ...] = ()
+    """Play only the test episodes in these rooms, such as FloorPlan228."""
+    targets: tuple[str, ...] = ()
+    """Play only the test episodes with these targets, such as Laptop."""
+
+    def check(self) -> None:
+        """Raises ValueError, with one line that names the flag, if a value is out of range."""
+        for name, value in (("step-limit", self.step_limit), ("episodes", self.episodes)):
+            if value is not None and (not _fits(value, int) or value < 1):
+                raise ValueError(f"--{name} {value}: must be a positive integer")
+
+    @property
+    def departures(self) -> dict[str, Any]:
+        """The values, by name, for which this is not the official test; none if it is."""
+        values = {name: getattr(self, name) for name in ("step_limit", "episodes")}
+        values |= {name: list(getattr(self, name)) for name in ("scenes", "targets")}
+        return {name: value for name, value in values.items() if value}
+
+    def locate(self, config: TrainConfig, run: Path | str) -> TrainConfig:
+        """A run's configuration with the files to evaluate it with.
+
+        Args:
+          config: the run's.
+          run: its folder.
+
+        Raises:
+          ValueError: a file that the run was trained with is not where it was; says how to give its
+            new place.
+        """
+        run = Path(run)
+        data = self.data
+        if data is None and config.data is not None:
+            data = config.data
+            if not Path(data).is_file():
+                raise ValueError(
+                    f"{data}: no such file; {run} was trained in these rooms: give the file's "
+                    "place with --data"
+                )
+        words = find_word_vectors(config, run, self.word_vectors)
+        return dataclasses.replace(config, data=data, word_vectors=words)
+
+
+def describe_departures(departures: Mapping[str, Any]) -> str:
+    """`EvalConfig.departures` in words, for reports."""
+    texts = {
+        "step_limit": "at most {} actions per episode",
+        "episodes": "at most {} episodes of each list, evenly spaced",
+        "scenes": "only in {}",
+        "targets": "only for {}",
+    }
+    parts = [
+        text.format(", ".join(value) if isinstance(value, list) else f"{value:,}")
+        for name, text in texts.items()
+        if (value := departures.get(name))
+    ]
+    return f"Not the official test: {'; '.join(parts)}"
+
+
+#: An evaluation of a run's own task.
+OWN_TASK = EvalConfig()
+
+
+def find_word_vectors(
+    config: TrainConfig, run: Path | str, instead: Path | str | None = None
+) -> str | None:
+    """The file of a run's word vectors; None if they are the bundled ones.
+
+    Args:
+      config: the run's.
+      run: its folder.
+      instead: a file to take in place of the run's own.
+
+    Raises:
+      ValueError: the run holds no copy of them, and the file is not where it was.
+    """
+    run = Path(run)
+    if instead is not None or config.word_vectors is None:
+        return None if instead is None else str(instead)
+    for path in (run / WORD_VECTORS_FILE, Path(config.word_vectors)):
+        if path.is_file():
+            return str(path)
+    raise ValueError(
+        f"{config.word_vectors}: no such file; {run} was trained with these word vectors and holds "
+        "no copy: give the file's place with --word-vectors"
+    )
+
+
 #: Names of settings, the condition on their values, and how an error states it.
 _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     (
@@ -313,12 +416,13 @@ def from_json(values: Mapping[str, Any]) -> TrainConfig:
     return config
 
 
-def save(config: TrainConfig, path: Path) -> None:
+def save(config: TrainConfig, path: Path | str) -> None:
     """Writes a run's `config.json`."""
+    path = Path(path)
     files.write_text(path, json.dumps(to_json(config), indent=2) + "\n")
 
 
-def load(path: Path) -> TrainConfig:
+def load(path: Path | str) -> TrainConfig:
     """Reads a run's `config.json`.
 
     Raises:
@@ -326,8 +430,9 @@ def load(path: Path) -> TrainConfig:
         neither imported already nor in `TDANET_TRUST`, as making it would run its code. The
         message names the file.
     """
+    path = Path(path)
     try:
-        config = from_json(json.loads(path.read_text()))
+        config = from_json(json.loads(files.read_text(path)))
         trusted = (*MODELS, *SENSORS, *sys.modules, *os.environ.get(TRUST, "").split(","))
         custom = {"model": (config.model,), "sensor": config.network.sensors}
         for kind, names in custom.items():
@@ -338,5 +443,7 @@ def load(path: Path) -> TrainConfig:
         return config
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; is this the folder of a run?") from None
+    except OSError as error:  # the folder is a file, for example
+        raise ValueError(f"{path}: {error.strerror}; is this the folder of a run?") from None
     except (json.JSONDecodeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from None

@@ -45,6 +45,7 @@ class Task:
         evaluation's rooms alone.
       train_words: [C, D], zero for hidden classes.
       words: [C, D], vectors of all classes.
+      vectors: the table of word vectors that they are from.
       extras: what came with imported rooms; None with the bundled ones.
     """
 
@@ -56,6 +57,7 @@ class Task:
     eval_params: EnvParams
     train_words: jax.Array
     words: jax.Array
+    vectors: WordVectors
     extras: Extras | None = None
 
     @property
@@ -218,6 +220,7 @@ def make_task(
         ),
         train_words=jnp.asarray(train_words),
         words=jnp.asarray(words),
+        vectors=vectors,
         extras=extras,
     )
 

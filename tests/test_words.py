@@ -172,3 +172,24 @@ def test_files_of_other_kinds(tmp_path: Path) -> None:
     for name in ("a.txt", "a.npz", "a.hdf5"):
         with pytest.raises(FileError, match=rf"{name}: no such file"):
             words.load_word_vectors(tmp_path / name)
+
+
+@pytest.mark.parametrize("names", [["CoffeeMachine", "Mug"], []])
+def test_a_copy_has_the_classes_exactly_and_the_other_words_in_16_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, names: list[str]
+) -> None:
+    monkeypatch.setattr(words, "ASSET_WORDS", 4)
+    labels = ["coffee", "machine", "coffee machine", "mug", "qwertz", "the", "huge"]
+    vectors = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
+    vectors[6] = 1e30  # too large for 16 bits
+    given = WordVectors({label: i for i, label in enumerate(labels)}, vectors)
+    given.save_copy(tmp_path / "copy.npz", [*names, "Huge", "Lighthouse"])
+    copy = words.load_word_vectors(tmp_path / "copy.npz")
+    # "qwertz" is neither among the first, nor bundled, nor a class.
+    assert list(copy.index) == ["coffee", "machine", "coffee machine", "mug", "the", "huge"]
+    exact = {"coffee machine", "mug", "huge"} if names else {"huge"}
+    for label, row in copy.index.items():
+        original = vectors[labels.index(label)]
+        assert (copy.vectors[row] == original).all() == (label in exact)
+        np.testing.assert_allclose(copy.vectors[row], original, rtol=1e-3)
+    assert [path.name for path in tmp_path.iterdir()] == ["copy.npz"]

@@ -18,14 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from tdanet_jax import config as configs
-from tdanet_jax import words as word_vectors
-from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax import words
+from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors
 from tdanet_jax.env.types import Observation
 from tdanet_jax.labels import LabelError, Labels, Synonyms
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
 from tdanet_jax.models.classes import ClassVocabulary, load_vocabulary
-from tdanet_jax.models.factory import make_model
+from tdanet_jax.models.factory import check_width, make_model
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.sensors import suite
 from tdanet_jax.sensors.detections import centre_and_area, merge_classes
@@ -256,19 +256,19 @@ class Agent:
 
     def _index(self, label: str) -> int:
         """The row in the table of classes of what a label means; new words get a new row."""
-        words = class_words(self.labels.resolve(label))
-        if words not in self._rows:
-            self._rows[words] = len(self._rows)
+        key = class_words(self.labels.resolve(label))
+        if key not in self._rows:
+            self._rows[key] = len(self._rows)
             self._table = None
-        return self._rows[words]
+        return self._rows[key]
 
     def _prepared(self) -> Any:
         if self._table is None:
-            names = [" ".join(words) for words in self._rows]
+            names = [" ".join(key) for key in self._rows]
             table = self._vectors.table(names, self.config.network.word_norm)
             rest = -len(table) % LABEL_BLOCK
-            words = jnp.asarray(np.pad(table, ((0, rest), (0, 0))))
-            self._table = actor_critic.prepare(self.model, self.weights, words)
+            padded = jnp.asarray(np.pad(table, ((0, rest), (0, 0))))
+            self._table = actor_critic.prepare(self.model, self.weights, padded)
         return self._table
 
     def _forward(
@@ -295,7 +295,10 @@ class Agent:
 
 
 def load(
-    run: Path | str, grid: PoseGrid = ITHOR, synonyms: Synonyms | Path | str | None = None
+    run: Path | str,
+    grid: PoseGrid = ITHOR,
+    word_vectors: Path | str | None = None,
+    synonyms: Synonyms | Path | str | None = None,
 ) -> Agent:
     """The agent of a run's newest checkpoint, or of a point of its history. Needs no rooms.
 
@@ -303,20 +306,32 @@ def load(
       run: the run's folder, or a file `history/<updates>.npz` in it.
       grid: the turns and steps of the world in which the agent acts, if it has sensors; it may
         have been trained on another.
+      word_vectors: file of word vectors in place of the run's copy, for example with more words;
+        they must be as wide.
 
     Raises:
-      ValueError: the folder holds no run, or its checkpoint cannot be read.
+      ValueError: the folder holds no run, its checkpoint cannot be read, or its word vectors are
+        missing or of another width.
     """
     config, weights, classes = read(run)
-    vectors = word_vectors.load_word_vectors(config.word_vectors, classes.names)
-    return Agent(config, weights, vectors, classes, grid, synonyms)
+    path = find_word_vectors(config, folder_of(run), word_vectors)
+    vectors = words.load_word_vectors(path, classes.names)
+    agent = Agent(config, weights, vectors, classes, grid, synonyms)
+    if path is not None:
+        shape = max(len(classes.names), 1), vectors.vectors.shape[1]
+        check_width(run, agent.model, weights, shape)
+    return agent
+
+
+def folder_of(run: Path | str) -> Path:
+    """The folder of a run, or of the run of a point of history (`history/<updates>.npz`)."""
+    path = Path(run)
+    return path.parent.parent if path.suffix == history.SUFFIX else path
 
 
 def read(run: Path | str) -> tuple[TrainConfig, Any, ClassVocabulary]:
     """What `load` makes an agent of: configuration, parameters, vocabulary."""
-    path = Path(run)
-    point = path.suffix == history.SUFFIX
-    folder = path.parent.parent if point else path
+    path, folder = Path(run), folder_of(run)
     config = configs.load(folder / CONFIG_FILE)
-    snapshot = history.read(path) if point else newest(folder)
+    snapshot = newest(folder) if path == folder else history.read(path)
     return config, snapshot.weights, load_vocabulary(folder)

@@ -185,8 +185,9 @@ def _sum_pairs(
     return jnp.zeros((3, *shape)).at[:, target].add(values * count[:, None])
 
 
-def write_csv(pairs: ClassPairs, path: Path) -> None:
+def write_csv(pairs: ClassPairs, path: Path | str) -> None:
     """Every pair that occurs, one a line: target, class, frames, attention, even."""
+    path = Path(path)
     with path.open("w", newline="") as file:
         table = csv.DictWriter(file, ["target", "class", "frames", "attention", "even"])
         table.writeheader()

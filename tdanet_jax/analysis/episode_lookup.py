@@ -16,6 +16,7 @@ import numpy as np
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.report import EPISODES_FILE
+from tdanet_jax.io import files
 from tdanet_jax.labels import Labels
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ACTION_NAMES
@@ -99,7 +100,7 @@ def read_record(run: Path | str, index: int, tables: SceneTables) -> Recorded:
     """
     path = Path(run) / EPISODES_FILE
     try:
-        lines = path.read_text().splitlines()
+        lines = files.read_text(path).splitlines()
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; a run writes it when training ends") from None
     if not 0 <= index < len(lines):

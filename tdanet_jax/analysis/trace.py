@@ -18,6 +18,7 @@ import numpy as np
 
 from tdanet_jax.agent import agent
 from tdanet_jax.analysis import attention
+from tdanet_jax.config import find_word_vectors
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import EnvParams, EnvState
 from tdanet_jax.evaluation import policies, rollout
@@ -26,6 +27,7 @@ from tdanet_jax.evaluation.policies import Policy
 from tdanet_jax.evaluation.rollout import Records
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
+from tdanet_jax.models.factory import check_width
 from tdanet_jax.scenes import camera_view
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.tables import SceneTables
@@ -68,8 +70,19 @@ class Player:
         return shapes[1].attention is not None
 
 
-def load_player(run: Path | str, rooms: Rooms, greedy: bool = False) -> Player:
+def load_player(
+    run: Path | str,
+    rooms: Rooms,
+    greedy: bool = False,
+    word_vectors: Path | str | None = None,
+) -> Player:
     """The agent of a training run, or of a point of its history, on the given rooms.
+
+    Args:
+      run: the run's folder, or a file `history/<updates>.npz` in it.
+      rooms: where it plays.
+      greedy: take the most probable action instead of sampling one.
+      word_vectors: file of word vectors in place of the run's copy.
 
     Returns:
       A player with the name of the run's folder, or of the point.
@@ -79,8 +92,11 @@ def load_player(run: Path | str, rooms: Rooms, greedy: bool = False) -> Player:
         maps that the rooms do not have, or it knows classes by index and the rooms have others.
     """
     config, weights, classes = agent.read(run)
-    task = task_in(rooms, config)
+    path = find_word_vectors(config, agent.folder_of(run), word_vectors)
+    task = task_in(rooms, dataclasses.replace(config, word_vectors=path))
     task.check_known(run, classes.names)
+    if path is not None:
+        check_width(run, task.model, weights, task.words.shape)
     return Player(Path(run).resolve().name, task, task.model, weights, greedy)
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tdanet_jax.config import TrainConfig
+from tdanet_jax.config import TrainConfig, describe_departures
 from tdanet_jax.evaluation import metrics, paper
 from tdanet_jax.evaluation.metrics import BUCKETS
 from tdanet_jax.splits import GROUPS
@@ -218,6 +218,9 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
       runs: a short name for each; points of one run, which are not averaged, share one.
     """
     lines = [f"# {title}", "", "SR and SPL in percent, test rooms."]
+    departures = results[0].get("departures") if results else None  # all are played alike
+    if departures:
+        lines += ["", f"**{describe_departures(departures)}.**"]
     for split in dict.fromkeys(result["split"] for result in results):
         own = [result for result in results if result["split"] == split]
         names = [run for run, r in zip(runs, results, strict=True) if r["split"] == split]
@@ -227,13 +230,14 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
         ]
         rows += (differing := list(_differences(own, names)))
         rows += _means(own, names)
-        for agent, groups in paper.rates(split).items():
+        published = {} if departures else paper.rates(split)
+        for agent, groups in published.items():
             rows.append(((f"{agent} (paper)", "", "", ""), groups))
         lines += ["", f"## Split {split}", ""]
         lines += table(("Agent", "Updates", "Training episodes", "Actions"), rows)
         if differing:
             lines += ["", "Differences: in the same episodes, 95 % intervals (paired bootstrap)."]
-        if paper.rates(split):
+        if published:
             worlds = dict.fromkeys(paper.worlds(result["data"]) for result in own)
             lines += ["", *worlds]
     return "\n".join(lines) + "\n"

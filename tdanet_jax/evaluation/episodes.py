@@ -80,8 +80,9 @@ def draw_split(tables: SceneTables, split: Split) -> dict[str, Episodes]:
     return lists
 
 
-def build_asset(tables: SceneTables, out_dir: Path) -> Path:
+def build_asset(tables: SceneTables, out_dir: Path | str) -> Path:
     """Writes the lists of every published split, and of its validation, for these tables."""
+    out_dir = Path(out_dir)
     arrays = {"data_version": np.frombuffer(tables.data_version.encode(), np.uint8)}
     for name in UNSEEN:
         for validation in (False, True):

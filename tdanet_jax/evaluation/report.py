@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import tdanet_jax
-from tdanet_jax.config import TrainConfig
+from tdanet_jax.config import TrainConfig, describe_departures
 from tdanet_jax.evaluation import paper
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.metrics import BUCKETS, grouped, shown, summarise
@@ -63,6 +63,7 @@ class Provenance:
     data: str | None = None  # file of their rooms, unless they are the bundled ones
     image: str | None = None  # the image that the model is shown, if there is one
     sensors: tuple[str, ...] = ()  # names of the agent's sensors; the paper's agents have none
+    departures: Mapping[str, Any] | None = None  # from the official test, if there are any
 
     @classmethod
     def of(
@@ -73,6 +74,7 @@ class Provenance:
         evaluation_seed: int,
         episodes: int = 0,
         updates: int = 0,
+        departures: Mapping[str, Any] | None = None,
     ) -> Provenance:
         """The provenance of a network's results, or of a policy's without a network.
 
@@ -83,6 +85,7 @@ class Provenance:
           evaluation_seed: of the actions sampled in the test episodes.
           episodes: training episodes of the network.
           updates: training updates of the network.
+          departures: from the official test (`EvalConfig.departures`).
         """
         network = policy in ("sample", "greedy")
         return cls(
@@ -97,6 +100,7 @@ class Provenance:
             data=config.data,
             image=task.image if network else None,
             sensors=task.spec.sensors if network else (),
+            departures=departures or None,
         )
 
 
@@ -187,7 +191,7 @@ def episode_rows(group: str, column: Columns, records: Records) -> list[dict[str
 
 
 def results(
-    provenance: Provenance, tables: SceneTables, played: Played, folder: Path | None = None
+    provenance: Provenance, tables: SceneTables, played: Played, folder: Path | str | None = None
 ) -> dict[str, Any]:
     """The content of `results.json` from the records of an evaluation.
 
@@ -198,6 +202,7 @@ def results(
       folder: where to write `results.json`, `results.md` and `episodes.jsonl`; created if need be.
         None writes nothing.
     """
+    folder = None if folder is None else Path(folder)
     groups = {name: columns(tables, *pair) for name, pair in played.items()}
     out = _results(provenance, groups, tables.room_types)
     if folder is not None:
@@ -209,8 +214,9 @@ def results(
     return out
 
 
-def write_rows(folder: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+def write_rows(folder: Path | str, rows: Iterable[Mapping[str, Any]]) -> None:
     """Writes `episodes.jsonl`."""
+    folder = Path(folder)
     with files.replacing(folder / EPISODES_FILE) as path, path.open("w") as file:
         file.writelines(json.dumps(row) + "\n" for row in rows)
 
@@ -224,13 +230,15 @@ def all_rows(tables: SceneTables, played: Played) -> Iterator[dict[str, Any]]:
 def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
     """`results.md`: tables as in the paper, with the paper's rows next to ours."""
     agent = ObservationSpec(sensors=tuple(out["sensors"])).agent_name(out["model"])
-    published = paper.rates(out["split"])
+    departures = out.get("departures")
+    published = {} if departures else paper.rates(out["split"])
     lines = [
         f"# {agent}, split {out['split']}, seed {out['seed']}",
         "",
         f"{out['episodes_trained']:,} training episodes, {out['steps']:,} environment steps; "
         f"{out['policy']} actions, evaluation seed {out['evaluation_seed']}; scene tables "
         f"{out['data_version']}, code {out['commit']}.",
+        *(["", f"**{describe_departures(departures)}.**", ""] if departures else []),
         *(f"{name.capitalize()}: {out[name]}." for name in ("data", "image") if out[name]),
         "",
         "SR and SPL in percent, with 95 % bootstrap intervals over (room, target) pairs.",

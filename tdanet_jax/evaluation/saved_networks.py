@@ -16,17 +16,21 @@ import jax
 import jax.numpy as jnp
 
 from tdanet_jax import config as configs
-from tdanet_jax.config import CONFIG_FILE, TrainConfig
-from tdanet_jax.evaluation import comparison, episodes, policies, report, rollout
+from tdanet_jax import words
+from tdanet_jax.config import CONFIG_FILE, OWN_TASK, WORD_VECTORS_FILE, EvalConfig, TrainConfig
+from tdanet_jax.evaluation import comparison, policies, report, rollout, selection
 from tdanet_jax.evaluation.report import Played
+from tdanet_jax.io import assets
 from tdanet_jax.models import classes
+from tdanet_jax.models.factory import check_width
 from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
 from tdanet_jax.task import Task, load_task
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import Checkpoints, is_shared, newest
 from tdanet_jax.training.history import Snapshot
 
-#: Networks in one call, at most; bounds the memory.
+#: Networks in one call on an accelerator, at most; bounds the memory. A CPU plays one after the
+#: other, so there each has a call of its own, and progress can be reported.
 TOGETHER = 20
 
 
@@ -37,12 +41,12 @@ class SavedNetwork:
     run: Path  # its run's folder
     config: TrainConfig  # of its run
     point: Path | None = None  # a file of the run's history, or None for its newest network
-    data: str | None = None  # file of rooms to evaluate in; None for those of its training
+    test: EvalConfig = OWN_TASK  # how it is evaluated
 
     @property
-    def rooms(self) -> str | None:
-        """File of the rooms that it is evaluated in; None for the bundled ones."""
-        return self.config.data if self.data is None else self.data
+    def located(self) -> TrainConfig:
+        """The run's configuration with the files that it is evaluated with."""
+        return self.test.locate(self.config, self.run)
 
     def load(self) -> Snapshot:
         """Reads the network. Raises ValueError if it cannot be read."""
@@ -80,42 +84,59 @@ class Evaluated:
         return {name: report.columns(self.task.tables, *pair) for name, pair in self.played.items()}
 
 
-def find(run: Path, with_history: bool = False, data: str | None = None) -> list[SavedNetwork]:
+def find(
+    run: Path | str, with_history: bool = False, test: EvalConfig | None = None
+) -> list[SavedNetwork]:
     """The newest network of a run, or its whole history, oldest first.
 
     Args:
       run: its folder.
       with_history: all points of its history.
-      data: file of rooms to evaluate in, instead of the run's.
+      test: how to evaluate them.
 
     Raises:
       ValueError: the folder holds no run, or none of its networks.
     """
+    run = Path(run)
+    test = test or OWN_TASK
     config = configs.load(run / CONFIG_FILE)
     if with_history:
         points: list[Path | None] = [*history.points(run)]
         if not points:
             raise ValueError(f"{run / history.FOLDER}: no history; train with --history above 0")
-        return [SavedNetwork(run, config, point, data) for point in points]
+        return [SavedNetwork(run, config, point, test) for point in points]
     if not is_shared(run) and Checkpoints(run).latest() is None:
         raise ValueError(f"{run}: no checkpoint")
-    return [SavedNetwork(run, config, None, data)]
+    return [SavedNetwork(run, config, None, test)]
 
 
-def share(run: Path, out: Path) -> None:
+def share(run: Path | str, out: Path | str, word_vectors: Path | str | None = None) -> None:
     """Makes a small folder of a run's newest network: enough to load, evaluate and look at it.
 
-    It holds the configuration, the classes, the network with 16 bits per parameter, and the run's
-    results and records if there are any; training cannot continue from it.
+    It holds the configuration, the classes, the network with 16 bits per parameter, a copy of the
+    word vectors unless they are the bundled ones, and the run's results and records if there are
+    any; training cannot continue from it. Rooms of `--data` stay where they are.
+
+    Args:
+      run: the run's folder.
+      out: folder to write.
+      word_vectors: where the run's word vectors are, if it holds no copy and the file was moved.
 
     Raises:
-      ValueError: the folder holds no run, or its network cannot be read or does not fit.
+      ValueError: the folder holds no run, its network cannot be read or does not fit, or its word
+        vectors are missing.
     """
-    network = find(run)[0]
+    run, out = Path(run), Path(out)
+    network, vocabulary = find(run)[0], classes.load_vocabulary(run)
+    snapshot = network.load()
+    path = configs.find_word_vectors(network.config, run, word_vectors)
+    vectors = None if path is None else words.load_word_vectors(path, vocabulary.names)
     out.mkdir(parents=True, exist_ok=True)
-    history.save(out / history.NETWORK, network.load(), half=True)
+    history.save(out / history.NETWORK, snapshot, half=True)
     configs.save(network.config, out / CONFIG_FILE)
-    classes.load_vocabulary(run).save(out)
+    vocabulary.save(out)
+    if vectors is not None:
+        vectors.save_copy(out / WORD_VECTORS_FILE, vocabulary.names)
     for name in (report.RESULTS_PAGE, report.EPISODES_FILE, report.RESULTS_FILE):
         if (run / name).is_file():
             shutil.copyfile(run / name, out / name)
@@ -137,12 +158,13 @@ def evaluate(
     groups: dict[TrainConfig, list[SavedNetwork]] = {}
     for network in networks:
         groups.setdefault(_task_config(network), []).append(network)
-    for config, members in groups.items():
-        task = load_task(config)
-        lists = episodes.load(task.tables, task.split, task.extras)
+    for members in groups.values():
+        task = load_task(members[0].located)
+        params, lists = selection.select(task, members[0].test)
         policy = policies.network(task.model, task.words, greedy)
-        for start in range(0, len(members), TOGETHER):
-            part = members[start : start + TOGETHER]
+        together = 1 if jax.default_backend() == "cpu" else TOGETHER
+        for start in range(0, len(members), together):
+            part = members[start : start + together]
             snapshots = [_checked(network, task) for network in part]
             weights = jax.tree.map(
                 lambda *leaves: jnp.stack(leaves), *(s.weights for s in snapshots)
@@ -150,9 +172,7 @@ def evaluate(
             seeds = [network.config.seed if seed is None else seed for network in part]
             # In parallel, adaptive networks would take their inner steps in every step.
             batched = False if isinstance(task.model, AdaptiveActorCritic) else None
-            played = rollout.evaluate_stacked(
-                policy, weights, task.eval_params, lists, seeds, batched
-            )
+            played = rollout.evaluate_stacked(policy, weights, params, lists, seeds, batched)
             for network, snapshot, own, drawn in zip(part, snapshots, played, seeds, strict=True):
                 yield Evaluated(
                     saved=network,
@@ -160,11 +180,12 @@ def evaluate(
                     task=task,
                     provenance=report.Provenance.of(
                         task,
-                        dataclasses.replace(network.config, data=network.rooms),
+                        dataclasses.replace(network.config, data=network.located.data),
                         "greedy" if greedy else "sample",
                         drawn,
                         snapshot.episodes,
                         snapshot.updates,
+                        network.test.departures,
                     ),
                     played=own,
                 )
@@ -175,17 +196,22 @@ def _task_config(network: SavedNetwork) -> TrainConfig:
 
     Runs of one task thus compare equal.
     """
-    kept = ("split", "model", "word_vectors", "validation", "network")
-    values: dict[str, Any] = {name: getattr(network.config, name) for name in kept}
-    return TrainConfig(data=network.rooms, **values)
+    kept = ("split", "model", "validation", "network", "data", "word_vectors")
+    located = network.located
+    values: dict[str, Any] = {name: getattr(located, name) for name in kept}
+    if located.word_vectors is not None:  # every run has a copy of its own
+        values["word_vectors"] = assets.sha256(Path(located.word_vectors))
+    return TrainConfig(**values)
 
 
 def _checked(network: SavedNetwork, task: Task) -> Snapshot:
     snapshot = network.load()
-    if network.data is None and snapshot.data_version != task.tables.data_version:
+    if network.test.data is None and snapshot.data_version != task.tables.data_version:
         raise ValueError(
             f"{network.point or network.run}: trained on scene tables {snapshot.data_version}, "
             f"these are {task.tables.data_version}"
         )
     task.check_known(network.run, classes.load_vocabulary(network.run).names)
+    if network.located.word_vectors is not None:
+        check_width(network.run, task.model, snapshot.weights, task.words.shape)
     return snapshot

@@ -7,6 +7,7 @@ import errno
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -50,6 +51,16 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def read_text(path: Path) -> str:
+    """The text of a file in UTF-8, with or without a byte-order mark.
+
+    Raises:
+      OSError: it cannot be read.
+      UnicodeDecodeError: it is not UTF-8.
+    """
+    return path.read_text(encoding="utf-8-sig")
+
+
 def remove_partial(folder: Path) -> list[Path]:
     """Removes unfinished files from `folder`; no other process may be writing to it."""
     found = sorted(folder.glob(f"{PARTIAL}*"))
@@ -91,26 +102,45 @@ def _is_running(process: int) -> bool:
 def check_empty(folder: Path, instead: str = "") -> None:
     """Raises ValueError unless `folder` is new, or holds only what a killed process left behind.
 
+    It must also be possible to write there.
+
     Args:
       instead: what to do otherwise, for the message.
     """
-    if not folder.exists():
-        return
     leftover = (LOCK_FILE, PARTIAL)
-    if not folder.is_dir() or any(not p.name.startswith(leftover) for p in folder.iterdir()):
+    if folder.exists() and (
+        not folder.is_dir() or any(not p.name.startswith(leftover) for p in folder.iterdir())
+    ):
         raise ValueError(f"--out {folder}: exists and is not empty{instead}")
+    check_writable(folder)
+
+
+def check_writable(out: Path) -> None:
+    """Raises ValueError unless a file or folder can be written at `out`; leaves nothing there.
+
+    Folders above it may have to be created.
+    """
+    above = out.absolute().parents
+    place = out if out.is_dir() else next(path for path in above if path.exists())
+    try:
+        with tempfile.TemporaryFile(dir=place):
+            pass
+    except OSError as error:
+        raise ValueError(f"--out {out}: {error.strerror}") from None
 
 
 @contextlib.contextmanager
 def locked(folder: Path, wait: bool = False) -> Iterator[None]:
     """Holds the lock of a folder, which is created if it does not exist.
 
-    The operating system releases the lock when the process ends, however it ends.
+    The operating system releases the lock when the process ends, however it ends. On an error, a
+    folder that was created for nothing is removed again.
 
     Raises:
       BlockingIOError: another process holds the lock, and `wait` is False.
       OSError: the folder cannot be written.
     """
+    created = [place for place in (folder, *folder.parents) if not place.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK_FILE)
     try:
@@ -119,5 +149,12 @@ def locked(folder: Path, wait: bool = False) -> Iterator[None]:
         raise BlockingIOError(errno.EWOULDBLOCK, "in use by another process", str(folder)) from None
     try:
         yield
+    except BaseException:
+        if created and [path.name for path in folder.iterdir()] == [LOCK_FILE]:
+            (folder / LOCK_FILE).unlink()
+            with contextlib.suppress(OSError):  # another process has come to use them
+                for place in created:
+                    place.rmdir()
+        raise
     finally:
         lock.release()

@@ -30,8 +30,9 @@ class ClassVocabulary:
     known: tuple[int, ...] = ()
     edges: tuple[tuple[int, int, float], ...] = ()
 
-    def save(self, run: Path) -> None:
+    def save(self, run: Path | str) -> None:
         """Writes `classes.json` into a run's folder."""
+        run = Path(run)
         files.write_text(run / CLASSES_FILE, json.dumps(dataclasses.asdict(self)) + "\n")
 
     def normalised_adjacency(self) -> np.ndarray:
@@ -76,7 +77,7 @@ def make_vocabulary(
     return ClassVocabulary(names, known, edges)
 
 
-def load_vocabulary(run: Path) -> ClassVocabulary:
+def load_vocabulary(run: Path | str) -> ClassVocabulary:
     """The vocabulary of a run; an empty one if it has no `classes.json`.
 
     Runs from before the file existed hold a TDANet, which needs no vocabulary.
@@ -84,12 +85,15 @@ def load_vocabulary(run: Path) -> ClassVocabulary:
     Raises:
       ValueError: the file is unreadable; the message names it.
     """
+    run = Path(run)
     path = run / CLASSES_FILE
     try:
-        values = json.loads(path.read_text())
+        values = json.loads(files.read_text(path))
         edges = tuple((int(i), int(j), float(w)) for i, j, w in values.get("edges", ()))
         return ClassVocabulary(tuple(values["names"]), tuple(values["known"]), edges)
     except FileNotFoundError:
         return ClassVocabulary()
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}") from None
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: not a vocabulary of this version: {error}") from None

@@ -8,11 +8,13 @@ processes need the tables at the same time, one computes them while the others w
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import importlib
 import inspect
 import os
 import shutil
+import tempfile
 import time
 import warnings
 from pathlib import Path
@@ -45,9 +47,27 @@ _MODULES = (
 
 
 def folder() -> Path:
-    """The cache folder: `TDANET_CACHE` if set, otherwise the platform's folder for caches."""
-    chosen = os.environ.get(VARIABLE)
-    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("tdanet_jax"))
+    """The cache folder: `TDANET_CACHE` if set, otherwise the platform's folder for caches.
+
+    A user without a home gets a temporary one, for this process alone, with a warning.
+    """
+    if chosen := os.environ.get(VARIABLE):
+        return Path(chosen)
+    try:
+        return Path(platformdirs.user_cache_dir("tdanet_jax"))
+    except RuntimeError:
+        return Path(_temporary().name)
+
+
+@functools.cache
+def _temporary() -> tempfile.TemporaryDirectory[str]:
+    """A cache folder that is removed when the process ends."""
+    warnings.warn(
+        f"no home folder for the cache: what is computed now will be again; set {VARIABLE} to a "
+        "folder to keep it",
+        stacklevel=3,
+    )
+    return tempfile.TemporaryDirectory(prefix="tdanet_jax-", ignore_cleanup_errors=True)
 
 
 def key() -> str:

@@ -56,6 +56,7 @@ def collect(
     return documents
 
 
-def write_scenes(documents: list[dict[str, Any]], path: Path) -> None:
+def write_scenes(documents: list[dict[str, Any]], path: Path | str) -> None:
     """Writes a scene file, atomically; an existing file is replaced."""
+    path = Path(path)
     files.write_text(path, json.dumps(documents))

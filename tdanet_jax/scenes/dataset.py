@@ -108,7 +108,7 @@ load = load_rooms  # its former name
 
 
 def build_rooms(
-    scene_file: Path, progress: Progress | None = None, kinds: Kinds | None = None
+    scene_file: Path | str, progress: Progress | None = None, kinds: Kinds | None = None
 ) -> Rooms:
     """The rooms of a scene file (JSON), see `metadata`.
 
@@ -119,6 +119,7 @@ def build_rooms(
     Raises:
       SceneError: the file is broken, or its rooms break a rule.
     """
+    scene_file = Path(scene_file)
     scenes = metadata.read_scenes(scene_file, kinds)
     try:
         tables = tabulation.build(scenes, progress=progress)
@@ -127,8 +128,9 @@ def build_rooms(
     return Rooms(tables, Extras(parts={s.name: s.part for s in scenes if s.part is not None}))
 
 
-def save_rooms(rooms: Rooms, path: Path) -> None:
+def save_rooms(rooms: Rooms, path: Path | str) -> None:
     """Writes a file of rooms, atomically."""
+    path = Path(path)
     extras = rooms.extras or Extras()
     notes = {
         "parents": extras.parents,

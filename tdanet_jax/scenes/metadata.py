@@ -37,6 +37,7 @@ from typing import Any
 
 import numpy as np
 
+from tdanet_jax.io import files
 from tdanet_jax.labels import ai2thor_class
 from tdanet_jax.poses import ITHOR, TURNS, PoseGrid
 from tdanet_jax.scenes import house
@@ -167,7 +168,7 @@ def _corners(scene: str, name: str, oriented: Any) -> np.ndarray:
     return np.array(points, np.float64)
 
 
-def read_scenes(path: Path, kinds: Kinds | None = None) -> list[Scene]:
+def read_scenes(path: Path | str, kinds: Kinds | None = None) -> list[Scene]:
     """The rooms of a scene file.
 
     Args:
@@ -176,10 +177,13 @@ def read_scenes(path: Path, kinds: Kinds | None = None) -> list[Scene]:
     Raises:
       SceneError: it is not such a file, or a scene breaks a rule.
     """
+    path = Path(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(files.read_text(path))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise SceneError(f"{path}: not JSON ({error})") from None
+    except OSError as error:
+        raise SceneError(f"{path}: {error.strerror}") from None
     documents = content if isinstance(content, list) else [content]
     if not documents:
         raise SceneError(f"{path}: no scenes")
@@ -187,7 +191,10 @@ def read_scenes(path: Path, kinds: Kinds | None = None) -> list[Scene]:
     names = [document.get("name") for document in documents if isinstance(document, Mapping)]
     if unknown := [name for name in kinds.table if name not in names]:
         raise SceneError(f"{path}: no room is called {unknown[0]}, which --rooms lists")
-    scenes = [_read_scene(path, document, kinds) for document in documents]
+    try:
+        scenes = [_read_scene(document, kinds) for document in documents]
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from None
     given = {record["objectType"] for document in documents for record in document["objects"]}
     renamed = [f"{name} as {known}" for name in sorted(given) if (known := _known(name)) != name]
     if renamed:
@@ -205,12 +212,12 @@ def read_scenes(path: Path, kinds: Kinds | None = None) -> list[Scene]:
     return scenes
 
 
-def _read_scene(path: Path, document: Any, kinds: Kinds) -> Scene:
+def _read_scene(document: Any, kinds: Kinds) -> Scene:
     if not isinstance(document, Mapping) or not isinstance(document.get("name"), str):
-        raise SceneError(f"{path}: a scene without a name")
+        raise SceneError("a scene without a name")
     name = document["name"]
-    check_name(name, f"{path}: room name")
-    room_type, part = _kind(path, name, document, kinds)
+    check_name(name)
+    room_type, part = _kind(name, document, kinds)
     rooms = _rooms(name, document)
     for key in ("objects", "reachable_positions"):
         if not isinstance(document.get(key), list):
@@ -272,9 +279,7 @@ def _known(name: str) -> str:
     return ai2thor_class(name) or name
 
 
-def _kind(
-    path: Path, name: str, document: Mapping[str, Any], kinds: Kinds
-) -> tuple[str, str | None]:
+def _kind(name: str, document: Mapping[str, Any], kinds: Kinds) -> tuple[str, str | None]:
     """Room type and part of a scene; the type is empty if its rooms have their own."""
     said = RoomKind(document.get("room_type"), document.get("split"))
     try:
@@ -284,7 +289,7 @@ def _kind(
     room_type, part = kinds.of(name, said)
     if room_type is None and document.get("rooms") is None:
         raise SceneError(
-            f'{path}: {name}: no room type; give it in the file ("room_type"), or import the file '
+            f'{name}: no room type; give it in the file ("room_type"), or import the file '
             "with --room-type or --rooms"
         )
     return room_type or "", part

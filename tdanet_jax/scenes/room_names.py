@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes.scene import SceneError
 from tdanet_jax.splits import ITHOR_ROOMS, PARTS, SCENE_NUMBERS, TRAIN_SCENES_PER_TYPE
@@ -120,7 +121,7 @@ def sort_key(name: str) -> tuple[tuple[bool, int, str], ...]:
     )
 
 
-def read_table(path: Path) -> dict[str, RoomKind]:
+def read_table(path: Path | str) -> dict[str, RoomKind]:
     """Name -> kind of the rooms in a CSV file with the columns name, room_type and part.
 
     Cells may be empty, and the columns of type or part missing: the table then says nothing of it.
@@ -128,11 +129,11 @@ def read_table(path: Path) -> dict[str, RoomKind]:
     Raises:
       FileError: it is not such a table; the message names line and column.
     """
+    path = Path(path)
     try:
         if path.stat().st_size > LARGEST_TABLE:
             raise FileError(path, f"larger than {LARGEST_TABLE >> 20} MiB")
-        # utf-8-sig: spreadsheets write a mark at the start.
-        rows = csv.reader(path.read_text(encoding="utf-8-sig").splitlines(), strict=True)
+        rows = csv.reader(files.read_text(path).splitlines(), strict=True)
         lines = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
     except OSError as error:
         raise FileError(path, error.strerror) from None

@@ -216,13 +216,15 @@ class SceneTables:
             grid=self.grid,
         )
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Writes the tables as a compressed npz without pickles."""
+        path = Path(path)
         archive.write(path, self.to_arrays(), compress=True)
 
     @classmethod
-    def load(cls, path: Path) -> SceneTables:
+    def load(cls, path: Path | str) -> SceneTables:
         """Reads what `save` wrote."""
+        path = Path(path)
         return cls.from_arrays(npz.read(path))
 
     def to_arrays(self) -> dict[str, np.ndarray]:

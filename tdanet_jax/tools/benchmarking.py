@@ -238,7 +238,7 @@ def evaluation_row(run: Path | None, task: Task, networks: int, repeats: int) ->
         weights = task.model.initialise(jax.random.key(0), task.words)
     else:
         network = saved_networks.find(run)[0]
-        task, weights = load_task(network.config), network.load().weights
+        task, weights = load_task(network.located), network.load().weights
     stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * networks), weights)
     policy = policies.network(task.model, task.words)
     lists = episodes.load(task.tables, task.split, task.extras)

@@ -46,12 +46,13 @@ class NewerFormat(ValueError):
     """A checkpoint that only a newer version can read."""
 
 
-def newest(run: Path) -> Snapshot:
+def newest(run: Path | str) -> Snapshot:
     """The network of a run's newest checkpoint, or of a shared agent's folder.
 
     Raises:
       ValueError: the folder holds none, or none can be read.
     """
+    run = Path(run)
     if is_shared(run):
         return history.read(run / history.NETWORK)
     checkpoints = Checkpoints(run)
@@ -60,15 +61,17 @@ def newest(run: Path) -> Snapshot:
     return checkpoints.snapshot()
 
 
-def is_shared(run: Path) -> bool:
+def is_shared(run: Path | str) -> bool:
     """Whether a folder holds a shared agent: a network, and nothing to continue training from."""
+    run = Path(run)
     return (run / history.NETWORK).exists()
 
 
 class Checkpoints:
     """The checkpoints of one run's folder."""
 
-    def __init__(self, run: Path) -> None:
+    def __init__(self, run: Path | str) -> None:
+        run = Path(run)
         self.folder = (run / FOLDER).absolute()
         # Every process reads for itself, and one alone writes: none waits for the others.
         here = jax.process_index()

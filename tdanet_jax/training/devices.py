@@ -19,22 +19,50 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from tdanet_jax.io import files
 from tdanet_jax.scenes import cache
 from tdanet_jax.training.learner import TrainState
 
 AXIS = "environments"
+PLATFORMS = "JAX_PLATFORMS"
 ADDRESS, PROCESSES, PROCESS = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
 #: Size of the cache of compiled programs, in bytes.
 COMPILED_SIZE = 2**30
 
 
 def keep_compiled() -> None:
-    """Caches compiled programs, so that a second start does not compile again."""
+    """Caches compiled programs, so that a second start does not compile again.
+
+    Does nothing if the cache cannot be written.
+    """
     folder = cache.folder() / "compiled"
+    try:
+        files.check_writable(folder)
+    except ValueError:
+        return  # JAX would warn of every program
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_compilation_cache_max_size", COMPILED_SIZE)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def start() -> None:
+    """Starts JAX, which otherwise happens at its first use.
+
+    Raises:
+      ValueError: it cannot be started; one line that names the variable.
+    """
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:  # AssertionError: no such device
+        chosen = os.environ.get(PLATFORMS)
+        where = f"{PLATFORMS}={chosen}: JAX finds no such device here" if chosen else "JAX"
+        reason = f" ({_first_line(error)})" if str(error) else ""
+        raise ValueError(f"{where}{reason}") from None
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0]
 
 
 def connect(count: int = 1) -> Mesh:
@@ -44,28 +72,45 @@ def connect(count: int = 1) -> Mesh:
       count: devices to use in this process; a CPU is split into as many.
 
     Raises:
-      ValueError: there are fewer devices, or the variables of a process are incomplete.
+      ValueError: there are fewer devices, JAX cannot be started, or the variables of a process are
+        incomplete or wrong.
     """
     if count < 1:
         raise ValueError(f"--devices {count}: must be positive")
     if count > 1:  # a CPU that is in use already cannot be split: too few devices, below
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", count)
-    if os.environ.get(ADDRESS):
-        try:
-            processes, process = int(os.environ[PROCESSES]), int(os.environ[PROCESS])
-        except (KeyError, ValueError):
-            raise ValueError(f"{ADDRESS} is set: {PROCESSES} and {PROCESS} must be, too") from None
-        # Processes on CPUs deadlock if each reduces in its own order.
-        flag = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}"
-        jax.distributed.initialize(os.environ[ADDRESS], processes, process)
+    if address := os.environ.get(ADDRESS):
+        _join(address)
+    start()
     if jax.local_device_count() < count:
         raise ValueError(f"--devices {count}: this machine has {jax.local_device_count()}")
     chosen: list[Any] = []
     for process in range(jax.process_count()):
         chosen += [d for d in jax.devices() if d.process_index == process][:count]
     return Mesh(np.array(chosen), (AXIS,))
+
+
+def _join(address: str) -> None:
+    """Joins the processes whose first one is at an address, HOST:PORT."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
+        raise ValueError(f"{ADDRESS}={address}: must be HOST:PORT, such as host0:1234")
+    try:
+        processes, process = int(os.environ[PROCESSES]), int(os.environ[PROCESS])
+    except (KeyError, ValueError):
+        raise ValueError(f"{ADDRESS} is set: {PROCESSES} and {PROCESS} must be, too") from None
+    if not 0 <= process < processes:
+        raise ValueError(
+            f"{PROCESS}={process}: must be from 0 to {processes - 1}, below {PROCESSES}"
+        )
+    # Processes on CPUs deadlock if each reduces in its own order.
+    flag = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}"
+    try:
+        jax.distributed.initialize(address, processes, process)
+    except RuntimeError as error:
+        raise ValueError(f"{ADDRESS}={address}: {_first_line(error)}") from None
 
 
 def first() -> Mesh:
@@ -112,17 +157,27 @@ def split(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec(AXIS))
 
 
+def check_divides(environments: int, mesh: Mesh, flag: str = "num-envs") -> None:
+    """Raises ValueError unless environments can be divided evenly; says which numbers can be."""
+    size, rest = mesh.size, environments % mesh.size
+    if rest:
+        fewer, more = environments - rest, environments - rest + size
+        divisors = [n for n in range(1, environments + 1) if environments % n == 0]
+        near = [n for n in divisors if n < size][-1:] + [n for n in divisors if n > size][:1]
+        raise ValueError(
+            f"--{flag} {environments}: cannot be divided evenly over {size} devices; "
+            f"{' or '.join(str(n) for n in (fewer, more) if n)} environments can be, or "
+            f"{' or '.join(map(str, near))} devices"
+        )
+
+
 def layout(state: Any, mesh: Mesh) -> Any:
     """The sharding of each array of a `TrainState`: split if it has a row per environment.
 
     Raises:
       ValueError: the environments cannot be divided evenly.
     """
-    environments = state.bootstrap_only.shape[0]
-    if environments % mesh.size:
-        raise ValueError(
-            f"--num-envs {environments}: must be a multiple of the {mesh.size} devices"
-        )
+    check_divides(state.bootstrap_only.shape[0], mesh)
 
     def place(tree: Any, sharding: NamedSharding) -> Any:
         return jax.tree.map(lambda _: sharding, tree)

@@ -53,15 +53,16 @@ def due(before: float, after: float, points: int) -> int:
     return reached if reached > passed else 0
 
 
-def write(run: Path, snapshot: Snapshot) -> Path:
+def write(run: Path | str, snapshot: Snapshot) -> Path:
     """Adds a point; the file appears complete or not at all."""
+    run = Path(run)
     path = run / FOLDER / f"{snapshot.updates:08d}{SUFFIX}"
     path.parent.mkdir(exist_ok=True)
     save(path, snapshot)
     return path
 
 
-def save(path: Path, snapshot: Snapshot, half: bool = False) -> None:
+def save(path: Path | str, snapshot: Snapshot, half: bool = False) -> None:
     """Writes a snapshot; the file appears complete or not at all.
 
     Args:
@@ -70,6 +71,7 @@ def save(path: Path, snapshot: Snapshot, half: bool = False) -> None:
     Raises:
       ValueError: a parameter is too large for that.
     """
+    path = Path(path)
     arrays = traverse_util.flatten_dict(jax.device_get(snapshot.weights), sep="/")
     if half:
         if any(abs(array).max(initial=0) > np.finfo(np.float16).max for array in arrays.values()):
@@ -81,12 +83,13 @@ def save(path: Path, snapshot: Snapshot, half: bool = False) -> None:
         np.savez(file, **content)
 
 
-def read(path: Path) -> Snapshot:
+def read(path: Path | str) -> Snapshot:
     """One point.
 
     Raises:
       ValueError: the file is missing, damaged or of a newer format; the message names it.
     """
+    path = Path(path)
     try:
         with np.load(path, allow_pickle=False) as data:
             content = {name: data[name] for name in data.files}
@@ -107,12 +110,13 @@ def read(path: Path) -> Snapshot:
     return Snapshot(weights=weights, **where)
 
 
-def checksums(path: Path) -> list[tuple[str, int]]:
+def checksums(path: Path | str) -> list[tuple[str, int]]:
     """Name and checksum (CRC-32) of every array of a point, from the file's directory alone.
 
     Raises:
       ValueError: the file is missing or damaged; the message names it.
     """
+    path = Path(path)
     try:
         with zipfile.ZipFile(path) as archive:
             return [(entry.filename, entry.CRC) for entry in archive.infolist()]
@@ -120,13 +124,15 @@ def checksums(path: Path) -> list[tuple[str, int]]:
         raise ValueError(f"{path}: unreadable ({error})") from error
 
 
-def points(run: Path) -> list[Path]:
+def points(run: Path | str) -> list[Path]:
     """The files of a run's history, oldest first."""
+    run = Path(run)
     return sorted(path for path in (run / FOLDER).glob(f"*{SUFFIX}") if path.stem.isdecimal())
 
 
-def drop_after(run: Path, updates: int) -> None:
+def drop_after(run: Path | str, updates: int) -> None:
     """Deletes the points after a checkpoint: their updates will be done again."""
+    run = Path(run)
     files.remove_partial(run / FOLDER)
     for path in points(run):
         if int(path.stem) > updates:

@@ -21,8 +21,9 @@ Row = dict[str, Any]
 class Journal:
     """`metrics.jsonl`. If it cannot be written, training continues and the rows wait in memory."""
 
-    def __init__(self, path: Path, updates: int) -> None:
+    def __init__(self, path: Path | str, updates: int) -> None:
         """Drops the rows after `updates`, whose updates will be done again."""
+        path = Path(path)
         self.path = path
         self._waiting: list[str] = []
         self._size = 0  # bytes of whole rows
@@ -47,8 +48,9 @@ class Journal:
                 warnings.warn(f"{self.path}: {reason}, its rows wait in memory", stacklevel=2)
 
 
-def read_metrics(folder: Path) -> list[Row]:
+def read_metrics(folder: Path | str) -> list[Row]:
     """The rows of a run's `metrics.jsonl`; a line that was cut short or damaged is left out."""
+    folder = Path(folder)
     rows = []
     for line in (folder / METRICS_FILE).read_text(errors="replace").splitlines():
         with contextlib.suppress(json.JSONDecodeError):
@@ -58,11 +60,12 @@ def read_metrics(folder: Path) -> list[Row]:
     return rows
 
 
-def tensorboard_sink(folder: Path) -> Callable[[Row], None]:
+def tensorboard_sink(folder: Path | str) -> Callable[[Row], None]:
     """A function that writes rows as TensorBoard events into `folder`/tensorboard.
 
     If events cannot be written, it gives up with a warning, and training continues.
     """
+    folder = Path(folder)
     # Not SummaryWriter: a full disk ends its thread, and its queue then blocks for ever.
     from tensorboardX.event_file_writer import EventsWriter
     from tensorboardX.proto.event_pb2 import Event

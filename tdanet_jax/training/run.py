@@ -25,7 +25,7 @@ class Run:
     """A run in its folder: `state` is its present state, `seconds` its training time so far."""
 
     def __init__(
-        self, folder: Path, config: TrainConfig, task: Task, mesh: Mesh | None = None
+        self, folder: Path | str, config: TrainConfig, task: Task, mesh: Mesh | None = None
     ) -> None:
         """The run in `folder`, new or from its newest checkpoint.
 
@@ -35,6 +35,7 @@ class Run:
         Raises:
           ValueError: the checkpoint does not fit the configuration or the rooms.
         """
+        folder = Path(folder)
         self.folder = folder
         self.config = config
         self.task = task

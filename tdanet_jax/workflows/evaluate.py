@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from tdanet_jax.analysis import figures
-from tdanet_jax.config import TrainConfig
-from tdanet_jax.evaluation import comparison, episodes, policies, report, rollout, saved_networks
+from tdanet_jax.config import OWN_TASK, EvalConfig, TrainConfig
+from tdanet_jax.evaluation import comparison, policies, report, rollout, saved_networks, selection
 from tdanet_jax.evaluation.policies import Policy
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
 from tdanet_jax.io import files
@@ -29,6 +30,7 @@ def evaluate(
     config: TrainConfig | None = None,
     history: bool = False,
     data: str | None = None,
+    test: EvalConfig | None = None,
     seed: int | None = None,
     out: Path | str | None = None,
     on_network: Callable[[float, str], None] | None = None,
@@ -42,12 +44,14 @@ def evaluate(
         "shortest_path"; or a custom `Policy`.
       config: rooms, classes and words for policies without a checkpoint; by default split 18/4.
       history: evaluate the whole history of each run instead of its newest checkpoint.
-      data: file of rooms to evaluate in, instead of the run's.
+      data: file of rooms to evaluate in, instead of the run's; short for `test.data`.
+      test: where the evaluation departs from the run's own task or `config`.
       seed: of sampled actions; by default the run's own, which gives the results that its training
         ended with, and `config.seed` without a run.
       out: folder to write: `results.json`, `results.md` and `episodes.jsonl` for one network,
         `evaluations.json`, `evaluations.md` and `episodes.jsonl` for several; None writes nothing.
-      on_network: called with the share of the networks that are done, and the last one's name.
+      on_network: for several networks, called with the share of them that is done and the name of
+        the last; before the first, with 0 and their number.
 
     Returns:
       The content of `results.json` for one network or policy, a list of them for several.
@@ -57,18 +61,26 @@ def evaluate(
         together.
     """
     folder = None if out is None else Path(out)
+    if folder is not None:
+        files.check_writable(folder)
+    test = test or OWN_TASK
+    test.check()
+    if data is not None:
+        test = dataclasses.replace(test, data=data)
     if checkpoint is None:
-        return _evaluate_policy(policy, config or TrainConfig(), seed, folder)
+        return _evaluate_policy(policy, config or TrainConfig(), test, seed, folder)
     if policy not in ("sample", "greedy"):
         raise ValueError(f"policy {policy}: a checkpoint's actions are sampled or greedy")
     single = isinstance(checkpoint, str | Path)
     runs = [Path(checkpoint)] if isinstance(checkpoint, str | Path) else [*map(Path, checkpoint)]
-    networks = [n for run in runs for n in saved_networks.find(run, history, data)]
+    networks = [n for run in runs for n in saved_networks.find(run, history, test)]
     evaluated = saved_networks.evaluate(networks, policy == "greedy", seed)
     if single and not history:
         done = next(evaluated)
         return report.results(done.provenance, done.task.tables, done.played, folder)
     results, records, columns = {}, [], {}
+    if on_network is not None:
+        on_network(0.0, f"{len(networks)} networks")
     for done in evaluated:
         results[done.saved] = done.results()
         if not history:
@@ -87,7 +99,11 @@ def evaluate(
 
 
 def _evaluate_policy(
-    policy: str | Policy, config: TrainConfig, seed: int | None, folder: Path | None
+    policy: str | Policy,
+    config: TrainConfig,
+    test: EvalConfig,
+    seed: int | None,
+    folder: Path | None,
 ) -> dict[str, Any]:
     """A policy without a checkpoint."""
     name = policy if isinstance(policy, str) else "custom"
@@ -96,10 +112,13 @@ def _evaluate_policy(
             known = ", ".join(UNTRAINED)
             raise ValueError(f"policy {policy}: needs a checkpoint, or choose one of {known}")
         policy = UNTRAINED[policy]()
+    files = {"data": test.data, "word_vectors": test.word_vectors}
+    chosen: dict[str, Any] = {name: path for name, path in files.items() if path is not None}
+    config = dataclasses.replace(config, **chosen)
     task, seed = load_task(config), config.seed if seed is None else seed
-    lists = episodes.load(task.tables, task.split, task.extras)
-    played = rollout.evaluate_lists(policy, None, task.eval_params, lists, seed)
-    provenance = report.Provenance.of(task, config, name, seed)
+    params, lists = selection.select(task, test)
+    played = rollout.evaluate_lists(policy, None, params, lists, seed)
+    provenance = report.Provenance.of(task, config, name, seed, departures=test.departures)
     return report.results(provenance, task.tables, played, folder)
 
 
@@ -129,10 +148,11 @@ def _write(
     files.write_text(folder / "evaluations.json", json.dumps(results, indent=2) + "\n")
 
 
-def short_names(runs: Sequence[Path]) -> dict[Path, str]:
+def short_names(runs: Sequence[Path | str]) -> dict[Path, str]:
     """A name for each run: its folder's, or the whole path if two folders have the same name."""
-    last = [run.resolve().name for run in runs]
+    paths = [Path(run) for run in runs]
+    last = [path.resolve().name for path in paths]
     return {
         run: name if last.count(name) == 1 else str(run)
-        for run, name in zip(runs, last, strict=True)
+        for run, name in zip(paths, last, strict=True)
     }

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from tdanet_jax import config as configs
-from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.config import CONFIG_FILE, OWN_TASK, TrainConfig
 from tdanet_jax.evaluation import comparison
 from tdanet_jax.evaluation.comparison import Result
 from tdanet_jax.io import files
@@ -49,7 +49,7 @@ def plan(
     return out
 
 
-def progress(folder: Path, config: TrainConfig) -> Literal["new", "begun", "finished"]:
+def progress(folder: Path | str, config: TrainConfig) -> Literal["new", "begun", "finished"]:
     """How far the run of a configuration is.
 
     Args:
@@ -59,6 +59,7 @@ def progress(folder: Path, config: TrainConfig) -> Literal["new", "begun", "fini
     Raises:
       ValueError: the folder holds a run of another configuration; the message names the flags.
     """
+    folder = Path(folder)
     from tdanet_jax.evaluation.report import RESULTS_FILE
 
     if not (folder / CONFIG_FILE).exists():
@@ -84,19 +85,20 @@ class FinishedRun:
     seconds: float | None  # training time; None if unknown
 
 
-def finished(folder: Path) -> FinishedRun:
+def finished(folder: Path | str) -> FinishedRun:
     """The finished run in a folder.
 
     Raises:
       ValueError: there is none; the message names the folder.
     """
+    folder = Path(folder)
     from tdanet_jax.evaluation.report import RESULTS_FILE
     from tdanet_jax.training.journal import METRICS_FILE, read_metrics
 
     config = configs.load(folder / CONFIG_FILE)
     path = folder / RESULTS_FILE
     try:
-        results = json.loads(path.read_text())
+        results = json.loads(files.read_text(path))
         results["seen"]["L>=1"], *(results[name] for name in _READ)
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; the run is not finished") from None
@@ -113,13 +115,15 @@ _READ = (
 )  # fmt: skip
 
 
-def find(out: Path) -> list[FinishedRun]:
+def find(out: Path | str) -> list[FinishedRun]:
     """The finished runs in a sweep's folder, by name."""
+    out = Path(out)
     return [finished(path) for path in _with_results(out) if (path / CONFIG_FILE).exists()]
 
 
-def find_others(out: Path) -> list[Path]:
+def find_others(out: Path | str) -> list[Path]:
     """Folders with results that are not runs, for example of the random policy."""
+    out = Path(out)
     return [path for path in _with_results(out) if not (path / CONFIG_FILE).exists()]
 
 
@@ -134,7 +138,7 @@ def labels(runs: Sequence[FinishedRun]) -> list[str]:
     return comparison.labels([run.results for run in runs], [run.folder.name for run in runs])
 
 
-def histories(runs: Sequence[FinishedRun], out: Path) -> Iterator[tuple[FinishedRun, int]]:
+def histories(runs: Sequence[FinishedRun], out: Path | str) -> Iterator[tuple[FinishedRun, int]]:
     """Evaluates the histories that are not evaluated yet, into `out`/histories/<run>.json.
 
     Actions are sampled with each run's own seed, so that its last point has the run's results.
@@ -143,6 +147,7 @@ def histories(runs: Sequence[FinishedRun], out: Path) -> Iterator[tuple[Finished
     Raises:
       ValueError: a point cannot be read, or belongs to other rooms.
     """
+    out = Path(out)
     from tdanet_jax.evaluation import saved_networks
     from tdanet_jax.training import history
 
@@ -163,13 +168,14 @@ def histories(runs: Sequence[FinishedRun], out: Path) -> Iterator[tuple[Finished
         yield run, len(done[folder])
 
 
-def evaluated_history(run: FinishedRun, out: Path) -> list[Result] | None:
+def evaluated_history(run: FinishedRun, out: Path | str) -> list[Result] | None:
     """The results of a run's history; None if it has not been evaluated, or has changed since."""
+    out = Path(out)
     path = out / HISTORIES / f"{run.folder.name}.json"
     if not path.exists():
         return None
     try:
-        kept = json.loads(path.read_text())
+        kept = json.loads(files.read_text(path))
         of, results = kept["of"], kept["results"]
     except (ValueError, KeyError, TypeError):
         return None
@@ -189,5 +195,6 @@ def untrained(runs: Sequence[FinishedRun], seed: int) -> list[Result]:
     """Results of random actions and of the shortest path on the splits of the runs."""
     from tdanet_jax.workflows.evaluate import UNTRAINED, evaluate
 
-    splits = {run.results["split"]: run.config for run in runs}.values()
-    return [evaluate(policy=n, config=config, seed=seed) for config in splits for n in UNTRAINED]
+    splits = {run.results["split"]: run for run in runs}.values()
+    located = [OWN_TASK.locate(run.config, run.folder) for run in splits]
+    return [evaluate(policy=n, config=config, seed=seed) for config in located for n in UNTRAINED]

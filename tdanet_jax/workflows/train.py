@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,12 @@ import jax
 
 from tdanet_jax import config as configs
 from tdanet_jax.analysis import figures
-from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.config import CONFIG_FILE, OWN_TASK, WORD_VECTORS_FILE, TrainConfig
 from tdanet_jax.evaluation import episodes, policies, report, rollout
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.io import files
 from tdanet_jax.models.factory import unused_flags
-from tdanet_jax.task import Task, load_task, resolve
+from tdanet_jax.task import load_task, resolve
 from tdanet_jax.training import checkpoint, devices
 from tdanet_jax.training.callbacks import Callbacks
 from tdanet_jax.training.journal import Row, read_metrics, tensorboard_sink
@@ -35,8 +36,8 @@ def train(
     """Trains a run to the end of its budget, evaluates it in the test rooms, and writes its report.
 
     Args:
-      config: the run. With `resume`, only its budget counts, as the run's new one; None keeps the
-        run's own.
+      config: the run. With `resume`, only its budget counts, as the run's new one, and `data`, the
+        new place of the run's rooms; None keeps the run's own.
       folder: where everything is written; new or empty, unless `resume`.
       resume: continue the run in `folder` from its newest checkpoint, bit for bit.
       device_count: devices to split the environments over, in this process.
@@ -60,72 +61,105 @@ def train(
         config.check()
         config = config.normalised()
     mesh = devices.connect(device_count)
+    devices.check_divides(config.learner.num_envs, mesh)
     devices.keep_compiled()
-    task = load_task(config, callbacks.on_rooms)
+    task = load_task(_located(config, folder), callbacks.on_rooms)
     lists = episodes.load(task.tables, task.split, task.extras)  # errors show before training
     for flag in () if resume else unused_flags(config, task.classes):
         callbacks.on_note(f"note: {flag} changes nothing for {config.model}")
     # What "auto" means here is part of the run: it continues with the same products elsewhere.
     config = resolve(config)
     with files.locked(folder) if devices.is_lead() else contextlib.nullcontext():
-        if devices.is_lead():
-            _prepare(folder, config, task, resume, callbacks)
+        if devices.is_lead() and not resume:
+            _check_new(folder)
         devices.wait_for_all("the folder is there")
         with callbacks.shield():
             run = Run(folder, config, task, mesh)
+        if resume:
+            _check_longer(run)
         devices.wait_for_all("the run is loaded")  # before anyone writes
+        if devices.is_lead():
+            _prepare(run, callbacks)
         callbacks.on_note(f"{run.title} -> {folder}")
         sink = tensorboard_sink(folder) if tensorboard and devices.is_lead() else None
         finished = _learn([run], ([row] for row in run.chunks()), callbacks, sink)
         return _report(run, lists, callbacks) if finished and devices.is_lead() else None
 
 
-def train_together(members: Sequence[tuple[TrainConfig, Path]], callbacks: Callbacks) -> None:
+def train_together(members: Sequence[tuple[TrainConfig, Path | str]], callbacks: Callbacks) -> None:
     """Trains seeds of one configuration in one vmapped call, and reports on each.
 
     Args:
       members: configurations that differ in their seed alone, and their folders, new or begun.
       callbacks: progress, and a way to stop.
     """
+    pairs = [(config, Path(folder)) for config, folder in members]
     with contextlib.ExitStack() as locks:
-        task = load_task(members[0][0], callbacks.on_rooms)
+        task = load_task(_located(*pairs[0]), callbacks.on_rooms)
         lists = episodes.load(task.tables, task.split, task.extras)
         runs = []
-        for config, folder in members:
+        for config, folder in pairs:
             locks.enter_context(files.locked(folder))
-            _prepare(folder, config, task, (folder / CONFIG_FILE).exists(), callbacks)
+            if not (folder / CONFIG_FILE).exists():
+                _check_new(folder)
             runs.append(Run(folder, config, task))
+            _prepare(runs[-1], callbacks)
             callbacks.on_note(f"{runs[-1].title} -> {folder}")
         if _learn(runs, chunks_together(runs), callbacks):
             for run in runs:
                 _report(run, lists, callbacks)
 
 
-def resumed(folder: Path, budget: TrainConfig | None = None) -> TrainConfig:
-    """The configuration of the run in a folder, with the budget of another if that has one.
+def resumed(folder: Path | str, new: TrainConfig | None = None) -> TrainConfig:
+    """The configuration of the run in a folder, with the budget and the rooms of another if any.
 
     Raises:
       ValueError: the folder holds no run, or nothing to continue from.
     """
+    folder = Path(folder)
     config = configs.load(folder / CONFIG_FILE)
     if checkpoint.is_shared(folder):
         raise ValueError(f"--resume {folder}: a shared agent; there is nothing to continue from")
-    if budget is not None and budget.budget:
-        config = config.with_budget(budget)
-        config.check()
+    if new is not None and new.budget:
+        config = config.with_budget(new)
+    if new is not None and new.data is not None:
+        config = dataclasses.replace(config, data=new.normalised().data)
+    config.check()
     return config
 
 
-def _prepare(
-    folder: Path, config: TrainConfig, task: Task, resume: bool, callbacks: Callbacks
-) -> None:
+def _located(config: TrainConfig, folder: Path) -> TrainConfig:
+    """The configuration of a new run, or of one that has begun, with the files that are there."""
+    begun = (folder / CONFIG_FILE).exists()
+    return OWN_TASK.locate(config, folder) if begun else config
+
+
+def _check_new(folder: Path) -> None:
+    """Raises ValueError unless a new run can begin in a folder."""
+    files.check_empty(folder, f" (to continue there: --resume {folder})")
+
+
+def _check_longer(run: Run) -> None:
+    """Raises ValueError if a run that continues has already spent its new budget."""
+    before = configs.load(run.folder / CONFIG_FILE).budget
+    if run.config.budget != before and run.progress >= 1.0:
+        done = f"{run.steps:,} steps, {int(run.state.episodes):,} episodes"
+        given = ", ".join(f"--{name} {limit}" for name, limit in run.config.budget.items())
+        raise ValueError(
+            f"{given}: {run.folder} has already trained as long, {done} and "
+            f"{run.seconds / 60:.1f} minutes; give a larger budget, or none to evaluate it again"
+        )
+
+
+def _prepare(run: Run, callbacks: Callbacks) -> None:
     """Writes what a run's folder holds from the start."""
-    if not resume:
-        files.check_empty(folder, f" (to continue there: --resume {folder})")
+    folder, task = run.folder, run.task
     for path in files.remove_partial(folder) + files.remove_partial(folder / checkpoint.FOLDER):
         callbacks.on_note(f"removed {path}: half-written when the run was stopped")
-    configs.save(config, folder / CONFIG_FILE)
+    if run.config.word_vectors is not None and not (folder / WORD_VECTORS_FILE).exists():
+        task.vectors.save_copy(folder / WORD_VECTORS_FILE, task.tables.classes)
     task.classes.save(folder)
+    configs.save(run.config, folder / CONFIG_FILE)
 
 
 def _learn(

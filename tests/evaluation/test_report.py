@@ -15,7 +15,7 @@ BUCKET = {"SR", "SPL", "SR_ci", "SPL_ci", "n"}
 TOP = [
     "version", "split", "model", "policy", "episodes_trained", "seen", "unseen", "by_room",
     "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "sensors",
-    "odometry", "triangulation", "commit",
+    "departures", "odometry", "triangulation", "commit",
 ]  # fmt: skip
 
 

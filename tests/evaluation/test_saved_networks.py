@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import chex
 import jax
@@ -11,20 +13,27 @@ import numpy as np
 import pytest
 
 import tdanet_jax
+from experiments import share
 from experiments.train_zero_shot import main as train
+from tdanet_jax import Agent, Callbacks, words
 from tdanet_jax.agent.agent import Detection
+from tdanet_jax.analysis import trace
+from tdanet_jax.config import WORD_VECTORS_FILE, EvalConfig
 from tdanet_jax.evaluation import report, saved_networks
-from tdanet_jax.scenes import SceneTables
+from tdanet_jax.scenes import SceneTables, dataset
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import newest
+from tdanet_jax.words import WordVectors
+from tdanet_jax.workflows import train as training
+from tests.conftest import TINY, save_untrained
 
 #: The agent that comes with the project.
 BUNDLED = Path(__file__).parents[2] / "agents" / "18-4-best"
 
 
-def decision(run: Path) -> np.ndarray:
+def decision(run: Path, agent: Agent | None = None) -> np.ndarray:
     """Action probabilities of a run's agent that sees a mug."""
-    agent = tdanet_jax.load(run)
+    agent = agent or tdanet_jax.load(run)
     seen = [Detection("mug", 0.4, 0.4, 0.5, 0.5)]
     return agent.act(agent.start(rotation=45), seen, target="mug")[1].probabilities
 
@@ -67,3 +76,81 @@ def test_a_shared_agent_is_not_resumed(
         train(["--resume", str(BUNDLED)])
     assert "there is nothing to continue from" in capsys.readouterr().err
     assert newest(BUNDLED).updates
+
+
+@pytest.fixture
+def run_of_files(
+    some_rooms: SceneTables, glove: WordVectors, rooms_file: Path, tmp_path: Path
+) -> Path:
+    """A run that was trained in rooms and with word vectors from files in its own folder."""
+    home = tmp_path / "home"
+    home.mkdir()
+    shutil.copy(rooms_file, home / "rooms.npz")
+    kept = sorted(glove.index, key=lambda word: glove.index[word])
+    np.savez(home / "vectors.npz", words=kept, vectors=glove.vectors * np.float32(1 + 1e-6))
+    config = dataclasses.replace(
+        TINY, data=str(home / "rooms.npz"), word_vectors=str(home / "vectors.npz")
+    )
+    vectors = words.load_word_vectors(config.word_vectors)
+    task, _ = save_untrained(config, home / "run", some_rooms, vectors)
+    training._prepare(SimpleNamespace(folder=home / "run", config=config, task=task), Callbacks())
+    return home / "run"
+
+
+@pytest.mark.parametrize("shared", [False, True], ids=["the run", "what is shared of it"])
+def test_a_run_leaves_its_machine(
+    run_of_files: Path,
+    few_episodes: None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    shared: bool,
+) -> None:
+    """Its files are gone, and where it goes, there are only its folder and the rooms."""
+    before = decision(run_of_files)
+    away = tmp_path / "away" / "agent"
+    if shared:
+        share.main(["--checkpoint", str(run_of_files), "--out", str(away)])
+        said = capsys.readouterr().out
+        assert "with a copy of its word vectors" in said
+        assert f"without its rooms, {run_of_files.parent / 'rooms.npz'}: " in said
+    else:
+        shutil.copytree(run_of_files, away)
+    rooms = shutil.copy(run_of_files.parent / "rooms.npz", away.parent / "elsewhere.npz")
+    shutil.rmtree(run_of_files.parent)
+
+    np.testing.assert_allclose(decision(away), before, atol=1e-2 if shared else 0)
+    assert tdanet_jax.load(away).knows("yesterday")  # a word of no class
+    with pytest.raises(ValueError, match=r"rooms.npz: no such file; .*with --data$"):
+        tdanet_jax.evaluate(away)
+    test_rooms = ("FloorPlan29", "FloorPlan229", "FloorPlan321", "FloorPlan428")  # all of them
+    results = tdanet_jax.evaluate(away, test=EvalConfig(data=str(rooms), scenes=test_rooms))
+    assert (results["seen"]["L>=1"]["n"], results["data"]) == (100, str(rooms))
+    assert results["departures"] == {"scenes": [*test_rooms]}
+    player = trace.load_player(away, dataset.load_rooms(rooms))
+    assert player.task.vectors.vectors.shape[1] == 50
+    saved_networks.share(away, tmp_path / "again")  # and on from there
+    np.testing.assert_allclose(decision(tmp_path / "again"), before, atol=1e-2)
+
+
+def test_a_run_without_a_copy_says_where_its_word_vectors_were(
+    run_of_files: Path, tmp_path: Path
+) -> None:
+    (run_of_files / WORD_VECTORS_FILE).unlink()  # as of earlier versions
+    before = decision(run_of_files)
+    moved = shutil.move(run_of_files.parent / "vectors.npz", tmp_path / "moved.npz")
+    gone = r"vectors.npz: no such file; .* holds no copy: give the file's place with --word-vectors"
+    with pytest.raises(ValueError, match=gone):
+        tdanet_jax.load(run_of_files)
+    with pytest.raises(ValueError, match=gone):
+        saved_networks.share(run_of_files, tmp_path / "shared")
+    assert not (tmp_path / "shared").exists()
+    agent = tdanet_jax.load(run_of_files, word_vectors=moved)
+    np.testing.assert_array_equal(decision(run_of_files, agent), before)
+    saved_networks.share(run_of_files, tmp_path / "shared", moved)
+    assert decision(tmp_path / "shared").shape == before.shape
+
+
+def test_word_vectors_of_another_width_are_refused(run_of_files: Path, tmp_path: Path) -> None:
+    np.savez(tmp_path / "wide.npz", words=["mug"], vectors=np.ones((1, 300)))
+    with pytest.raises(ValueError, match="trained with word vectors of another width than 300"):
+        tdanet_jax.load(run_of_files, word_vectors=tmp_path / "wide.npz")

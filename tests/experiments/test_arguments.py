@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,10 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--out full/file/below", "full/file/below: Not a directory"),
         ("--resume nowhere", "nowhere/config.json: no such file; is this the folder of a run?"),
         ("--devices 0", "--devices 0: must be positive"),
+        ("--steps 1.5", "invalid literal for int() with base 10: '1.5'"),
+        ("--steps 1e6.5", "invalid literal for int() with base 10: '1e6.5'"),
+        ("--steps 1e-6", "invalid literal for int() with base 10: '1e-6'"),
+        ("--steps=-1e6", "invalid literal for int() with base 10: '-1e6'"),
         ("--resume nowhere --seed 5", "--resume continues a run as it began: it takes a new"),
         ("--resume full/file", "full/file/config.json: Not a directory"),
         ("--resume broken", "broken/config.json: Expecting property name"),
@@ -66,14 +71,18 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint full --split 18/4", "--split 18/4: a run is evaluated on its own split"),
         ("--policy random --history", "--policy random has no --history"),
         ("--checkpoint full --validation", "--validation: a trained run has its own rooms"),
-        ("--checkpoint full --word-vectors x", "--word-vectors x: a trained run has its own"),
         ("--policy random --word-vectors x.txt", "x.txt: no such file"),
         ("--checkpoint a --checkpoint a", "--checkpoint: a run is given twice"),
         ("--checkpoint a --checkpoint b", "several checkpoints need --out"),
+        ("--policy random --step-limit 0", "--step-limit 0: must be a positive integer"),
+        ("--policy random --episodes=-1", "--episodes -1: must be a positive integer"),
+        ("--policy random --targets Lamp", "--targets Lamp: in no test episode; did you mean"),
+        ("--policy random --scenes FloorPlan1", "--scenes FloorPlan1: in no test episode; did"),
         ("--policy random --seed x", "invalid literal for int() with base 10: 'x'"),
         ("--policy random --seed=-1", "--seed -1: must be between 0 and"),
         ("--policy random --out full", "--out full: exists and is not empty"),
         ("--policy random --out full/file", "--out full/file: exists and is not empty"),
+        ("--policy random --out full/file/below", "--out full/file/below: Not a directory"),
         ("--policy dance", "invalid choice 'dance' for argument '--policy'"),
         ("--checkpoint nowhere", "nowhere/config.json: no such file"),
         ("--checkpoint binary", "binary/config.json: 'utf-8' codec can't decode"),
@@ -88,11 +97,13 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--precisions int8", "invalid choice 'int8' for argument '--precisions'"),
         ("--parts everything", "invalid choice 'everything'"),
         ("--out full", "--out full: exists"),
+        ("--out full/file/below", "full/file/below: Not a directory"),
     ],
     "share": [
         ("", "Missing from share: --checkpoint PATH"),
         ("--checkpoint bare --out full", "--out full: exists and is not empty"),
         ("--checkpoint bare --out new", "bare: no checkpoint"),
+        ("--checkpoint bare --out full/file/below", "--out full/file/below: Not a directory"),
         ("--checkpoint nowhere --out new", "nowhere/config.json: no such file"),
     ],
     "replay": [
@@ -101,6 +112,8 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint nowhere --episode 3", "nowhere/config.json: no such file"),
         ("--checkpoint bare --episode 3 --scene X", "--episode takes no --scene, --target or"),
         ("--checkpoint bare --scene FloorPlan1 --target Mug", "bare/checkpoints: no checkpoint"),
+        ("--checkpoint bare --episode 3 --out full", "--out full: is a folder"),
+        ("--checkpoint bare --episode 3 --out full/file/a", "--out full/file/a: Not a directory"),
         ("--checkpoint bare --episode x", "invalid literal for int() with base 10: 'x'"),
         ("--checkpoint bare --episode 3 --seed=-1", "--seed -1: must be between 0 and 4294967295"),
         (
@@ -117,11 +130,15 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint bare --start 0 0 20", "--start 0.0 0.0 20: rotation 20: not a multiple of"),
         ("--checkpoint bare --episode 3 --seed=-1", "--seed -1: must be between 0 and 4294967295"),
         ("--checkpoint bare --episode 3 --out a.doc", "--out a.doc: end it in one of ."),
+        ("--checkpoint bare --episode 3 --out full/file/a.png", "full/file/a.png: Not a directory"),
+        ("--checkpoint bare --episode 3 --out full/file/a.gif", "full/file/a.gif: Not a directory"),
     ],
     "attention": [
         ("", "Missing from attention: --checkpoint"),
         ("--checkpoint bare --scene FloorPlan1", "give --scene and --target, or --episode"),
         ("--checkpoint bare", "bare/checkpoints: no checkpoint"),
+        ("--checkpoint bare --out full/file", "--out full/file: is a file"),
+        ("--checkpoint bare --out full/file/a", "--out full/file/a: Not a directory"),
         ("--checkpoint bare --seed=-1", "--seed -1: must be between 0 and 4294967295"),
     ],
     "sweep": [
@@ -133,6 +150,8 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--out new --vmap-seeds --minutes 3", "--vmap-seeds needs a budget in --steps"),
         ("--out new --report-only --steps 5", "--report-only trains nothing and takes no --steps"),
         ("--out new --include full", "full"),
+        ("--out full/file", "--out full/file: is a file"),
+        ("--out full/file/below", "--out full/file/below: Not a directory"),
     ],
     "scaling": [
         ("--rooms 10 0", "--rooms 0: must be positive"),
@@ -140,6 +159,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--classes 10", "--classes 10: the rooms need at least 117"),
         ("--detections 3", "--detections 3: the rooms need at least"),
         ("--out full", "--out full: exists and is not empty"),
+        ("--out full/file/below", "--out full/file/below: Not a directory"),
     ],
     "scenes": [
         ("", "Expected one of {build"),
@@ -159,7 +179,9 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("inspect FloorPlan1 --position 0 0 --horizon 5", "horizon 5: not among 0, 30 degrees"),
         ("inspect FloorPlan1 --position nan 0", "--position nan 0.0: must be finite"),
         ("inspect FloorPlan1 --out a.doc", "--out a.doc: end it in one of ."),
-        ("inspect FloorPlan1 --out no/a.png", "no/a.png: No such file or directory"),
+        ("inspect FloorPlan1 --out full/file/a.png", "--out full/file/a.png: Not a directory"),
+        ("build --out full/file", "--out full/file: is a file"),
+        ("export --out full/file/below", "--out full/file/below: Not a directory"),
         ("inspect Lab --scenes nope.json", "nope.json: No such file or directory"),
         ("import nope.json", "nope.json: No such file or directory"),
         ("import full", "full: Is a directory"),
@@ -208,6 +230,12 @@ def assert_one_line(said: str, message: str) -> None:
     assert "Traceback" not in said
 
 
+def main_of(name: str) -> Callable[[list[str]], None]:
+    """The function behind `python -m experiments.NAME`."""
+    main: Callable[[list[str]], None] = importlib.import_module(f"experiments.{name}").main
+    return main
+
+
 def flat(cases: dict[str, list[tuple[str, str]]]) -> list[tuple[str, str, str]]:
     return [(name, *case) for name, rows in cases.items() for case in rows]
 
@@ -219,7 +247,7 @@ def test_wrong_arguments_give_one_line_and_write_nothing(
 ) -> None:
     before, folders = content_of(folder), sorted(folder.rglob("*"))
     with pytest.raises(SystemExit) as stopped:
-        importlib.import_module(f"experiments.{name}").main(arguments.split())
+        main_of(name)(arguments.split())
     assert stopped.value.code == 2
     assert_one_line(capsys.readouterr().err, message)
     assert content_of(folder) == before

@@ -1,9 +1,11 @@
 """The training command, as a user types it."""
 
 import json
+import os
 import re
 import signal
 import socket
+import sys
 import time
 from pathlib import Path
 
@@ -12,6 +14,7 @@ import pytest
 import tdanet_jax
 from experiments import evaluate, train_zero_shot
 from tdanet_jax.io import files
+from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.workflows import train as training
 from tests.support import command
 
@@ -73,17 +76,29 @@ def test_a_split_of_ones_own_is_trained_evaluated_and_gone_on_with(
     ithor, few_episodes, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    arguments = ["--split", "towel,mug,CD", "--steps", "400", "--precision", "float32"]
-    with monkeypatch.context() as patch:
+    arguments = ["--split", "towel,mug,CD", "--steps", "4e2", "--precision", "float32"]
+    reader, writer = os.pipe()
+    os.close(reader)  # as `| head` does
+    with monkeypatch.context() as patch, os.fdopen(writer, "w") as broken:
         patch.setattr(training, "_report", lambda *_: None)  # to save time
+        patch.setattr(sys, "stdout", broken)
         train_zero_shot.main([*arguments, *command.TINY])
+    assert "output cannot be written (Broken pipe)" in capsys.readouterr().err
     [run] = (tmp_path / "runs").iterdir()
+    assert Checkpoints(run).latest() == 10
     assert re.fullmatch(r"Mug-CD-Towel-tdanet-seed0-\d{8}-\d{6}", run.name)
     left = run / "checkpoints" / f"{files.PARTIAL}{2**22 + 1}-20"  # of no process
     left.mkdir()
     with files.locked(run), pytest.raises(SystemExit):
         train_zero_shot.main(["--resume", str(run)])
     assert f"error: {run}: in use by another process\n" == capsys.readouterr().err
+    before = (run / "config.json").read_text()
+    with pytest.raises(SystemExit):
+        train_zero_shot.main(["--resume", str(run), "--steps", "300"])
+    done = f"{run} has already trained as long, 400 steps, "
+    assert capsys.readouterr().err.startswith(f"error: --steps 300: {done}")
+    assert (run / "config.json").read_text() == before
+    assert left.exists()
     train_zero_shot.main(["--resume", str(run), "--steps", "600"])
     assert f"removed {left}: half-written when the run was stopped" in capsys.readouterr().out
     assert {p.name for p in run.iterdir()} == WRITTEN | {files.LOCK_FILE}

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
+import platformdirs
 import pytest
 
 from tdanet_jax.io import files
@@ -168,3 +169,26 @@ def test_unused_files_are_removed(folder: Path, monkeypatch: pytest.MonkeyPatch)
 def test_the_platforms_place_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(cache.VARIABLE, raising=False)
     assert "tdanet_jax" in str(cache.folder())
+
+
+def test_a_user_without_a_home_gets_a_temporary_folder_and_one_warning(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    """As a user id that a container does not know, with HOME unset."""
+
+    def no_home(name: str) -> str:
+        raise RuntimeError("could not determine the home directory")
+
+    monkeypatch.delenv(cache.VARIABLE)
+    monkeypatch.setattr(platformdirs, "user_cache_dir", no_home)
+    cache._temporary.cache_clear()
+    version = cache.load_tables().data_version
+    forbid_building(monkeypatch)
+    assert cache.load_tables().data_version == version
+    [warning] = recwarn
+    assert "no home folder for the cache" in str(warning.message)
+    assert cache.VARIABLE in str(warning.message)
+    place = cache.folder()
+    assert files_of(place)
+    cache._temporary.cache_clear()  # as at the end of the process
+    assert not place.exists()

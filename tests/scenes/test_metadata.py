@@ -219,6 +219,7 @@ def test_rules(tmp_path: Path, path: list[Any], value: Any, message: str | None)
     with pytest.raises(SceneError, match=message) as error:
         read(tmp_path, broken(path, value))
     assert "\n" not in str(error.value)
+    assert str(error.value).startswith(f"{tmp_path / 'scenes.json'}: ")
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", "[1]", "3", "null", "[" * 100_000])
@@ -267,7 +268,12 @@ places = st.sampled_from(
 def test_whatever_is_wrong_is_a_scene_error(path: list[Any], value: Any) -> None:
     message = ""
     try:
-        metadata._read_scene(Path("scenes.json"), broken(path, value), Kinds())
+        metadata._read_scene(broken(path, value), Kinds())
     except SceneError as error:
         message = str(error)
     assert "\n" not in message
+
+
+def test_a_byte_order_mark_is_no_matter(tmp_path: Path) -> None:
+    [scene] = read(tmp_path, "\ufeff" + json.dumps(DOCUMENT))
+    assert scene.name == "Lab"

@@ -32,6 +32,19 @@ PARAMS, AGENT, SUITE = "env/params.py", "agent/agent.py", "sensors/suite.py"
 ODOMETRY, TRIANGULATION = "sensors/odometry.py", "sensors/triangulation.py"
 TEST_TDANET = "models/test_tdanet.py"
 FAULTS = (
+    Fault("a copy of word vectors is rough", "words.py", "np.where(whole[:, None], vectors, rounded)",
+          "rounded", "test_words.py"),
+    Fault("a run's copy is not looked at", "config.py", "(run / WORD_VECTORS_FILE, Path(config.w",
+          "(Path(config.w", "evaluation/test_saved_networks.py"),
+    Fault("a part passes for the test", "evaluation/saved_networks.py", "network.test.departures,",
+          "None,", "evaluation/test_saved_networks.py"),
+    Fault("the first episodes, not even ones", "evaluation/selection.py",
+          "np.arange(test.episodes) * len(found) // test.episodes", "np.arange(test.episodes)",
+          "evaluation/test_selection.py"),
+    Fault("a refused run leaves its folder", "io/files.py", "if created and [", "if False and [",
+          "training/test_devices.py"),
+    Fault("a budget that is spent is taken", "workflows/train.py", "!= before and run.progress >= 1.0",
+          "!= before and False", "experiments/test_train_zero_shot.py"),
     Fault("rotation sign", ODOMETRY, "Action.ROTATE_RIGHT, 1, 0", "Action.ROTATE_RIGHT, -1, 0",
           "env/test_dynamics.py"),
     Fault("impossible look", ODOMETRY, "Action.LOOK_UP, higher, horizon",

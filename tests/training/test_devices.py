@@ -5,14 +5,16 @@ import os
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import pytest
 
-from tdanet_jax.config import PRESETS, TrainConfig
+from tdanet_jax.config import PRESETS, LearnerConfig, TrainConfig
 from tdanet_jax.task import make_task
 from tdanet_jax.training import devices, learner
+from tdanet_jax.workflows import train as training
 
 #: In a process of its own, which alone can split its CPU into eight devices.
 EIGHT = """
@@ -67,6 +69,92 @@ def test_more_devices_than_there_are_is_one_clear_error():
         devices.connect(present + 1)
     with pytest.raises(ValueError, match="--devices 0: must be positive"):
         devices.connect(0)
+
+
+@pytest.mark.parametrize(
+    ("environments", "count", "what"),
+    [
+        (256, 3, "255 or 258 environments can be, or 2 or 4 devices"),
+        (256, 6, "252 or 258 environments can be, or 4 or 8 devices"),
+        (256, 7, "252 or 259 environments can be, or 4 or 8 devices"),
+        (2, 3, "3 environments can be, or 2 devices"),
+    ],
+)
+def test_environments_that_cannot_be_divided_say_which_can(environments, count, what):
+    with pytest.raises(ValueError, match=f"--num-envs {environments}: cannot") as error:
+        devices.check_divides(environments, SimpleNamespace(size=count))
+    assert str(error.value).endswith(f" {count} devices; {what}")
+    devices.check_divides(256, SimpleNamespace(size=8))
+
+
+@pytest.mark.usefixtures("ithor")
+def test_a_run_that_is_refused_leaves_nothing(tmp_path, monkeypatch):
+    """Whether what it lacks is found before its folder is made, or after."""
+    out = tmp_path / "new" / "run"
+    config = TrainConfig(learner=LearnerConfig(num_envs=3))
+    with monkeypatch.context() as patch:
+        patch.setattr(devices, "connect", lambda count: SimpleNamespace(size=2))
+        with pytest.raises(ValueError, match="2 or 4 environments can be, or 1 or 3 devices"):
+            training.train(config, out, device_count=2)
+    assert list(tmp_path.iterdir()) == []
+
+    def refuse(*arguments):
+        assert out.is_dir()
+        raise ValueError("too large for this device")
+
+    monkeypatch.setattr(training, "Run", refuse)
+    with pytest.raises(ValueError, match="too large"):
+        training.train(config, out)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("platform", "error", "what"),
+    [
+        ("cuda", AssertionError(), "JAX_PLATFORMS=cuda: JAX finds no such device here$"),
+        ("gpu", RuntimeError("no rocm\nmore"), r"JAX_PLATFORMS=gpu: JAX .* here \(no rocm\)$"),
+        (None, RuntimeError("no cpu"), r"^JAX \(no cpu\)$"),
+    ],
+)
+def test_a_jax_that_cannot_be_started_is_one_clear_error(monkeypatch, platform, error, what):
+    def fail():
+        raise error
+
+    monkeypatch.setattr(jax, "devices", fail)
+    monkeypatch.delenv(devices.PLATFORMS, raising=False)
+    if platform is not None:
+        monkeypatch.setenv(devices.PLATFORMS, platform)
+    with pytest.raises(ValueError, match=what):
+        devices.connect()
+
+
+@pytest.mark.parametrize(
+    ("address", "processes", "process", "what"),
+    [
+        ("host0", "2", "0", "JAX_COORDINATOR_ADDRESS=host0: must be HOST:PORT"),
+        ("host0:", "2", "0", "JAX_COORDINATOR_ADDRESS=host0:: must be HOST:PORT"),
+        (":1234", "2", "0", "JAX_COORDINATOR_ADDRESS=:1234: must be HOST:PORT"),
+        ("host0:http", "2", "0", "JAX_COORDINATOR_ADDRESS=host0:http: must be HOST:PORT"),
+        ("host0:99999", "2", "0", "JAX_COORDINATOR_ADDRESS=host0:99999: must be HOST:PORT"),
+        ("host0:1234", "2", "2", "JAX_PROCESS_ID=2: must be from 0 to 1, below JAX_NUM_PROCESSES"),
+        ("host0:1234", "2", "-1", "JAX_PROCESS_ID=-1: must be from 0 to 1"),
+        ("host0:1234", "2", "1", "JAX_COORDINATOR_ADDRESS=host0:1234: no answer$"),
+    ],
+)
+def test_processes_that_cannot_join_are_one_clear_error(
+    monkeypatch, address, processes, process, what
+):
+    def initialize(*arguments):
+        raise RuntimeError("no answer\nmore")
+
+    monkeypatch.setattr(jax.distributed, "initialize", initialize)
+    monkeypatch.setenv("XLA_FLAGS", "")  # restored afterwards
+    for name, value in (
+        (devices.ADDRESS, address), (devices.PROCESSES, processes), (devices.PROCESS, process)
+    ):  # fmt: skip
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ValueError, match=what):
+        devices.connect()
 
 
 def test_a_process_that_does_not_know_its_number_is_one_clear_error(monkeypatch):

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
+from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import FileError
 
 #: Bytes of the largest file that is read; the raw metadata of one scene is some hundred million.
@@ -78,7 +79,7 @@ def _text(path: Path) -> str:
     if path.stat().st_size > LARGEST:
         raise FileError(path, f"larger than {LARGEST >> 30} GiB")
     try:
-        return path.read_text(encoding="utf-8")
+        return files.read_text(path)
     except UnicodeDecodeError as error:
         raise FileError(path, f"not JSON ({error})") from None
 

@@ -119,7 +119,7 @@ def read_graph(names_path: Path, matrix_path: Path) -> tuple[tuple[str, ...], np
     for path in (names_path, matrix_path):
         if not path.is_file() or path.stat().st_size > pickles.LARGEST_FILE:
             raise FileError(path, "no such file, or too large")
-    text = names_path.read_text(encoding="utf-8", errors="replace")
+    text = names_path.read_text(encoding="utf-8-sig", errors="replace")
     names = tuple(line.strip() for line in text.splitlines() if line.strip())
     if not 0 < len(names) <= MOST_CLASSES or len(set(names)) != len(names):
         raise FileError(names_path, "not a list of distinct class names")

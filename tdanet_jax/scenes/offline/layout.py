@@ -148,7 +148,7 @@ class Grid:
           FileError: it is not a key, or its point is not on the grid.
         """
         if not isinstance(key, str):
-            raise FileError(path, "a state key that is not text")
+            raise FileError(path, f"a state key that is not text: {key!r}")
         if key not in self._known:
             self._known[key] = self._parse(path, key)
         return self._known[key]

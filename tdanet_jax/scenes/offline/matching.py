@@ -6,7 +6,7 @@ Some recordings list boxes by id as well.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -54,18 +54,24 @@ class BoxMatcher:
     Args:
       path: the file of boxes, for messages.
       owners: state -> ids of the objects to which its boxes belong, in order; None if unknown.
+      keys: of all states, for messages.
 
     Attributes:
       names: the classes or ids by which boxes were listed.
     """
 
     def __init__(
-        self, path: Path, objects: Objects, owners: dict[int, list[str]] | None = None
+        self,
+        path: Path,
+        objects: Objects,
+        owners: dict[int, list[str]] | None,
+        keys: Sequence[str],
     ) -> None:
         self.names: set[str] = set()
         self._path = path
         self._objects = objects
         self._owners = owners
+        self._keys = keys
         self._by_class: dict[str, list[str]] = defaultdict(list)
         for name in sorted(objects.classes):
             self._by_class[objects.classes[name]].append(name)
@@ -89,32 +95,33 @@ class BoxMatcher:
             visible = self._visible.get(state, set())
             self.names.update(groups)
             if any(map(is_id, groups)):
-                pairs = [p for name, boxes in groups.items() for p in self._by_id(name, boxes)]
+                pairs = [p for item in groups.items() for p in self._by_id(state, *item)]
             elif self._owners is None:
                 pairs = [
                     p for kind, group in groups.items() for p in self._guess(kind, group, visible)
                 ]
             else:
-                pairs = self._look_up(self._owners.get(state, []), groups)
+                pairs = self._look_up(state, self._owners.get(state, []), groups)
             self._rows += [(state, name, box, name in visible) for name, box in pairs]
             lacking = visible - {name for name, _ in pairs}
             self._rows += [(state, name, NO_BOX, True) for name in lacking]
         for state in self._visible.keys() - done:
             self._rows += [(state, name, NO_BOX, True) for name in self._visible[state]]
 
-    def _by_id(self, name: str, boxes: np.ndarray) -> list:
+    def _by_id(self, state: int, name: str, boxes: np.ndarray) -> list:
         if len(boxes) > 1:
-            raise FileError(self._path, f"{name}: {len(boxes)} boxes of one object in a state")
+            where = f"{self._keys[state]}: {name}"
+            raise FileError(self._path, f"{where}: {len(boxes)} boxes of one object in a state")
         if name not in self._objects.classes:  # visible from nowhere
             self._objects.add(self._path, name, class_of(name), place_in(name))
         return [(name, tuple(box)) for box in boxes.tolist()]
 
-    def _look_up(self, owners: list[str], groups: dict[str, np.ndarray]) -> list:
+    def _look_up(self, state: int, owners: list[str], groups: dict[str, np.ndarray]) -> list:
         classes = [kind for kind, boxes in groups.items() for _ in boxes]
         flat = [tuple(box) for boxes in groups.values() for box in boxes.tolist()]
         known = [self._objects.classes[name] for name in owners]
         if known != classes or len(set(owners)) != len(owners):
-            raise FileError(self._path, f"the boxes do not fit {OBJECT_FILE}")
+            raise FileError(self._path, f"{self._keys[state]}: the boxes do not fit {OBJECT_FILE}")
         return list(zip(owners, flat, strict=True))
 
     def _guess(self, object_class: str, boxes: np.ndarray, visible: set[str]) -> list:

@@ -74,7 +74,7 @@ def read_scene(folder: Path, name: str, room_type: str, frame: Frame | None = No
         boxes = read_boxes(folder / layout.BOX_FILE, grid, frame)
     else:
         noted.append(f"no {layout.BOX_FILE}, so no detections")
-    matcher = BoxMatcher(folder / layout.BOX_FILE, objects, owners)
+    matcher = BoxMatcher(folder / layout.BOX_FILE, objects, owners, layout.state_keys(grid.points))
     matcher.add(boxes)
     if odd_names := sorted(n for n in matcher.names if not is_id(n) and not _CLASS.fullmatch(n)):
         noted.append(
@@ -205,7 +205,7 @@ def read_visibility(path: Path, grid: Grid) -> Objects:
         elif isinstance(value, Mapping) and isinstance(value.get("objects"), list):
             state = grid.state(path, name)
             for record in value["objects"]:
-                _add_record(path, objects, record, state)
+                _add_record(path, name, objects, record, state)
         else:
             raise FileError(path, f"{name}: neither a list of states nor an event's metadata")
     if not objects.classes:
@@ -213,12 +213,12 @@ def read_visibility(path: Path, grid: Grid) -> Objects:
     return objects
 
 
-def _add_record(path: Path, objects: Objects, record: Any, state: int) -> None:
+def _add_record(path: Path, key: str, objects: Objects, record: Any, state: int) -> None:
     fields = record if isinstance(record, Mapping) else {}
     name, object_class, visible = (fields.get(k) for k in ("objectId", "objectType", "visible"))
     named = name and object_class and isinstance(visible, bool)
     if not named or not isinstance(name, str) or not isinstance(object_class, str):
-        raise FileError(path, "an object without objectId, objectType or visible")
+        raise FileError(path, f"{key}: an object without objectId, objectType or visible")
     if name not in objects.classes:
         objects.add(path, name, object_class, place_in(name))
     if visible:

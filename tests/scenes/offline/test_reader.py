@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -314,6 +315,8 @@ def test_what_contradicts_the_layout_names_file_and_reason(folder: Path, case: i
     assert name in str(error.value)
     assert reason in str(error.value)
     assert str(error.value).isprintable()
+    if name == "objects_bb.json" or reason == "an object without":
+        assert re.search(r"\d\.\d\d\|-?\d+\.\d\d\|\d+\|\d+", str(error.value))  # the state
 
 
 @pytest.mark.parametrize("value", ["NaN", "-Infinity", "1e999", "9" * 400])

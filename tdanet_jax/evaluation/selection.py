@@ -1,0 +1,85 @@
+"""Which episodes an evaluation plays, and in which environment: the official test, or a part of it.
+
+Parts are for a quick look and for questions of one's own; reports say that they are not the test.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Iterable, Mapping
+
+import jax.numpy as jnp
+import numpy as np
+
+from tdanet_jax.config import EvalConfig
+from tdanet_jax.env.types import EnvParams
+from tdanet_jax.evaluation import episodes
+from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.task import Task
+
+
+def select(task: Task, test: EvalConfig) -> tuple[EnvParams, dict[str, Episodes]]:
+    """The environment of an evaluation, and its episodes by group.
+
+    Raises:
+      ValueError: a value is out of range, a name is unknown, or no episode is left.
+    """
+    test.check()
+    lists = choose(episodes.load(task.tables, task.split, task.extras), task.tables, test)
+    params = task.eval_params
+    if test.step_limit is not None:
+        params = params.replace(step_limit=jnp.full_like(params.step_limit, test.step_limit))
+    return params, lists
+
+
+def choose(
+    lists: Mapping[str, Episodes], tables: SceneTables, test: EvalConfig
+) -> dict[str, Episodes]:
+    """The episodes in the chosen rooms, with the chosen targets, and evenly spaced ones of these.
+
+    Groups without any are left out.
+
+    Raises:
+      ValueError: no episode has a chosen room or target, or none has both; names the flag.
+    """
+    scenes = {group: _scene_names(chosen, tables) for group, chosen in lists.items()}
+    targets = {group: np.array(tables.targets)[one.target] for group, one in lists.items()}
+    wanted_scenes = find_names("scenes", test.scenes, np.unique([*_values(scenes)]))
+    wanted_targets = find_names("targets", test.targets, np.unique([*_values(targets)]))
+    out = {}
+    for group, one in lists.items():
+        kept = np.isin(scenes[group], wanted_scenes) & np.isin(targets[group], wanted_targets)
+        found = np.flatnonzero(kept)
+        if test.episodes is not None and len(found) > test.episodes:
+            found = found[np.arange(test.episodes) * len(found) // test.episodes]
+        if len(found):
+            out[group] = Episodes(one.pose[found], one.target[found])
+    if not out:
+        raise ValueError("--scenes, --targets: no test episode has one of these targets there")
+    return out
+
+
+def find_names(flag: str, given: Collection[str], known: Iterable[str]) -> list[str]:
+    """The names that a flag gives; all that are known if it gives none.
+
+    Raises:
+      ValueError: a name is not known; suggests a similar one, or lists them all.
+    """
+    names = [str(name) for name in known]
+    for name in given:
+        if name not in names:
+            similar = {each.lower(): each for each in names}
+            near = difflib.get_close_matches(name.lower(), similar, n=1)
+            hint = f"did you mean {similar[near[0]]}?" if near else f"there are {', '.join(names)}"
+            raise ValueError(f"--{flag} {name}: in no test episode; {hint}")
+    return list(given) or names
+
+
+def _scene_names(chosen: Episodes, tables: SceneTables) -> np.ndarray:
+    """The room of each episode, [E] text."""
+    return np.array(tables.scenes)[tables.position_scene[tables.grid.split(chosen.pose).position]]
+
+
+def _values(by_group: Mapping[str, np.ndarray]) -> Iterable[str]:
+    return (str(value) for values in by_group.values() for value in values)

@@ -1,0 +1,155 @@
+"""A part of the test episodes, other limits, and that reports say so."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import tdanet_jax
+from experiments import evaluate
+from tdanet_jax import EvalConfig
+from tdanet_jax.config import OWN_TASK, describe_departures
+from tdanet_jax.env.params import TEST_STEP_LIMITS
+from tdanet_jax.evaluation import comparison, episodes, selection
+from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.scenes import SceneTables
+from tdanet_jax.splits import make_split
+
+
+@pytest.fixture(scope="module")
+def lists(ithor: SceneTables) -> dict[str, Episodes]:
+    """The test episodes of split 18/4."""
+    return episodes.load(ithor, make_split("18/4"))
+
+
+def chosen(
+    lists: dict[str, Episodes], tables: SceneTables, **values: object
+) -> dict[str, list[tuple[str, str]]]:
+    """Rooms and targets of the chosen episodes."""
+    found = selection.choose(lists, tables, EvalConfig(**values))  # type: ignore[arg-type]
+    return {
+        group: [
+            (tables.scenes[tables.state_scene[pose]], tables.targets[target])
+            for pose, target in zip(one.pose, one.target, strict=True)
+        ]
+        for group, one in found.items()
+    }
+
+
+def test_without_a_choice_all_are_played(lists: dict[str, Episodes], ithor: SceneTables) -> None:
+    found = selection.choose(lists, ithor, OWN_TASK)
+    assert found.keys() == lists.keys()
+    for group, one in found.items():
+        np.testing.assert_array_equal(one.pose, lists[group].pose)
+        np.testing.assert_array_equal(one.target, lists[group].target)
+
+
+@pytest.mark.parametrize(("count", "kept"), [(4, [0, 250, 500, 750]), (3, [0, 333, 666])])
+def test_some_episodes_are_evenly_spaced(
+    lists: dict[str, Episodes], ithor: SceneTables, count: int, kept: list[int]
+) -> None:
+    found = selection.choose(lists, ithor, EvalConfig(episodes=count))
+    for group, one in found.items():
+        np.testing.assert_array_equal(one.pose, lists[group].pose[kept])
+        np.testing.assert_array_equal(one.target, lists[group].target[kept])
+    many = selection.choose(lists, ithor, EvalConfig(episodes=5000))
+    assert [len(one) for one in many.values()] == [1000, 1000]
+
+
+def test_rooms_and_targets_are_chosen_by_name(
+    lists: dict[str, Episodes], ithor: SceneTables
+) -> None:
+    everything = chosen(lists, ithor)
+    rooms, targets = ("FloorPlan228", "FloorPlan30"), ("Laptop", "Television", "Toaster")
+    there = chosen(lists, ithor, scenes=rooms)
+    assert there == {g: [p for p in pairs if p[0] in rooms] for g, pairs in everything.items()}
+    both = chosen(lists, ithor, scenes=rooms[:1], targets=targets, episodes=5)
+    assert set(both["unseen"]) == {("FloorPlan228", "Laptop")}
+    assert set(both["seen"]) == {("FloorPlan228", "Television")}
+    assert len(both["unseen"]) == 5
+    assert list(chosen(lists, ithor, targets=["Laptop"])) == ["unseen"]  # never a seen one
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"targets": ("Laptpo",)}, "--targets Laptpo: in no test episode; did you mean Laptop?"),
+        ({"targets": ("laptop",)}, "--targets laptop: in no test episode; did you mean Laptop?"),
+        ({"targets": ("Oxygen",)}, "--targets Oxygen: in no test episode; there are AlarmClock, "),
+        ({"scenes": ("FloorPlan1",)}, "--scenes FloorPlan1: in no test episode; did you mean"),
+        (
+            {"scenes": ("FloorPlan228",), "targets": ("Toaster",)},
+            "--scenes, --targets: no test episode has one of these targets there",
+        ),
+    ],
+)
+def test_an_unknown_name_is_one_clear_error(
+    lists: dict[str, Episodes], ithor: SceneTables, values: dict[str, object], message: str
+) -> None:
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
+        chosen(lists, ithor, **values)
+
+
+@pytest.mark.parametrize("values", [{"step_limit": 0}, {"episodes": -1}, {"step_limit": 1.5}])
+def test_a_value_out_of_range_is_named(values: dict[str, int]) -> None:
+    [(name, value)] = values.items()
+    with pytest.raises(ValueError, match=f"--{name.replace('_', '-')} {value}: must be a positive"):
+        tdanet_jax.evaluate(policy="random", test=EvalConfig(**values))
+
+
+def test_a_step_limit_replaces_that_of_every_room_type(ithor: SceneTables) -> None:
+    limits = jnp.asarray(TEST_STEP_LIMITS)
+    kept: dict[str, object] = {}
+    params = SimpleNamespace(step_limit=limits, replace=lambda **values: kept.update(values))
+    task = SimpleNamespace(tables=ithor, split=make_split("18/4"), extras=None, eval_params=params)
+    selection.select(task, EvalConfig(step_limit=7))  # type: ignore[arg-type]
+    assert kept["step_limit"].tolist() == [7] * len(limits)  # type: ignore[attr-defined]
+    assert selection.select(task, OWN_TASK)[0] is params  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("ithor")
+def test_the_results_say_that_it_is_not_the_test(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The optimum cannot be reached in three actions where L is larger."""
+    out = tmp_path / "out"
+    evaluate.main(
+        ["--policy", "shortest_path", "--step-limit", "3", "--episodes", "1_0", "--targets",
+         "Laptop", "Television", "--scenes", "FloorPlan228", "FloorPlan229", "--out", str(out)]
+    )  # fmt: skip
+    said = (
+        "Not the official test: at most 3 actions per episode; at most 10 episodes of each list, "
+        "evenly spaced; only in FloorPlan228, FloorPlan229; only for Laptop, Television"
+    )
+    assert said in capsys.readouterr().out
+    page = (out / "results.md").read_text()
+    assert f"**{said}.**" in page
+    assert "(paper)" not in page
+    results = json.loads((out / "results.json").read_text())
+    assert results["departures"] == {
+        "step_limit": 3, "episodes": 10, "scenes": ["FloorPlan228", "FloorPlan229"],
+        "targets": ["Laptop", "Television"],
+    }  # fmt: skip
+    records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    assert len(records) == 20
+    assert all(record["success"] == (record["L"] <= 3) for record in records)
+    assert max(record["e"] for record in records) == 3
+
+
+def test_a_page_on_several_networks_says_so_too() -> None:
+    departures = EvalConfig(episodes=20).departures
+    assert OWN_TASK.departures == EvalConfig(data="rooms.npz").departures == {}
+    result = {
+        "split": "18/4", "model": "tdanet", "policy": "sample", "seed": 0, "data": None,
+        "data_version": "a", "updates": 1, "episodes_trained": 1, "seen": None, "unseen": None,
+        "by_room": {}, "departures": departures,
+    }  # fmt: skip
+    page = comparison.markdown("2 checkpoints", [result, result], ["a", "b"])
+    assert f"**{describe_departures(departures)}.**" in page
+    assert "(paper)" not in page
