@@ -257,7 +257,11 @@ def load(run: Path | str, grid: PoseGrid = ITHOR) -> Agent:
     """
     config, weights, classes = read(run)
     vectors = word_vectors.load_word_vectors(config.word_vectors, classes.names)
-    return Agent(config, weights, vectors, classes, grid)
+    agent = Agent(config, weights, vectors, classes, grid)
+    width = vectors.vectors.shape[1]
+    expected = agent.model.parameter_shapes(max(len(classes.names), 1), width)
+    history.check_fit(Path(run), weights, expected)
+    return agent
 
 
 def read(run: Path | str) -> tuple[TrainConfig, Any, ClassVocabulary]:

@@ -30,6 +30,7 @@ from tdanet_jax.scenes import camera_view
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.task import Task, task_in
+from tdanet_jax.training import history
 from tdanet_jax.vocabulary import Action
 
 
@@ -81,6 +82,7 @@ def load_player(run: Path | str, rooms: Rooms, greedy: bool = False) -> Player:
     config, weights, classes = agent.read(run)
     task = task_in(rooms, config)
     task.check_known(run, classes.names)
+    history.check_fit(Path(run), weights, task.model.parameter_shapes(*task.words.shape))
     return Player(Path(run).resolve().name, task, task.model, weights, greedy)
 
 

@@ -7,7 +7,7 @@ compilation.
 from __future__ import annotations
 
 import dataclasses
-import shutil
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,8 @@ from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.evaluation import comparison, episodes, policies, report, rollout
 from tdanet_jax.evaluation.report import Played
+from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import regular
 from tdanet_jax.models import classes
 from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
 from tdanet_jax.task import Task, load_task
@@ -117,8 +119,10 @@ def share(run: Path, out: Path) -> None:
     configs.save(network.config, out / CONFIG_FILE)
     classes.load_vocabulary(run).save(out)
     for name in (report.RESULTS_PAGE, report.EPISODES_FILE, report.RESULTS_FILE):
-        if (run / name).is_file():
-            shutil.copyfile(run / name, out / name)
+        if os.path.lexists(run / name):
+            content = regular.read_bytes(run / name, links=False)
+            with files.replacing(out / name) as fresh:
+                fresh.write_bytes(content)
 
 
 def evaluate(
@@ -141,9 +145,12 @@ def evaluate(
         task = load_task(config)
         lists = episodes.load(task.tables, task.split, task.extras)
         policy = policies.network(task.model, task.words, greedy)
+        expected = task.model.parameter_shapes(*task.words.shape)
         for start in range(0, len(members), TOGETHER):
             part = members[start : start + TOGETHER]
             snapshots = [_checked(network, task) for network in part]
+            for network, snapshot in zip(part, snapshots, strict=True):
+                history.check_fit(network.point or network.run, snapshot.weights, expected)
             weights = jax.tree.map(
                 lambda *leaves: jnp.stack(leaves), *(s.weights for s in snapshots)
             )

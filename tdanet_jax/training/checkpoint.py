@@ -11,6 +11,8 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import logging
+import math
+import os
 import shutil
 import sys
 import threading
@@ -22,9 +24,10 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
-from flax import traverse_util
 
 from tdanet_jax.io import assets, files
+from tdanet_jax.io.untrusted import FileError, regular
+from tdanet_jax.io.untrusted.budgets import unpacking_excess
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
 from tdanet_jax.training.renames import renamed
@@ -62,7 +65,7 @@ def newest(run: Path) -> Snapshot:
 
 def is_shared(run: Path) -> bool:
     """Whether a folder holds a shared agent: a network, and nothing to continue training from."""
-    return (run / history.NETWORK).exists()
+    return os.path.lexists(run / history.NETWORK)
 
 
 class Checkpoints:
@@ -73,10 +76,11 @@ class Checkpoints:
         # Every process reads for itself, and one alone writes: none waits for the others.
         here = jax.process_index()
         alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
+        self._arrays = ocp.StandardCheckpointHandler(multiprocessing_options=alone)
         self._orbax = ocp.Checkpointer(
             ocp.CompositeCheckpointHandler(
                 composite_options=ocp.CompositeOptions(multiprocessing_options=alone),
-                state=ocp.StandardCheckpointHandler(multiprocessing_options=alone),
+                state=self._arrays,
                 meta=ocp.JsonCheckpointHandler(multiprocessing_options=alone),
             ),
             multiprocessing_options=alone,
@@ -90,13 +94,12 @@ class Checkpoints:
         """
         updates = int(state.updates)
         path = self.folder / str(updates)
-        fresh = self.folder / f"{files.PARTIAL}{updates}"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            shutil.rmtree(fresh, ignore_errors=True)
             content = jax.device_get(_plain(state))
             _check_space(self.folder, content)
-            with _quiet_threads():
+            with files.private_folder(self.folder) as partial, _quiet_threads():
+                fresh = partial / path.name
                 self._orbax.save(
                     fresh,
                     args=ocp.args.Composite(
@@ -104,10 +107,10 @@ class Checkpoints:
                         meta=ocp.args.JsonSave({**meta, "format": FORMAT}),
                     ),
                 )
-            sums = "".join(f"{sha}  {name}\n" for name, sha in _checksums(fresh).items())
-            (fresh / CHECKSUMS).write_text(sums)
-            shutil.rmtree(path, ignore_errors=True)  # only a damaged one can be there
-            fresh.rename(path)
+                sums = "".join(f"{sha}  {name}\n" for name, sha in _checksums(fresh).items())
+                (fresh / CHECKSUMS).write_text(sums)
+                shutil.rmtree(path, ignore_errors=True)  # only a damaged one can be there
+                fresh.rename(path)
         except Exception as error:  # Orbax and TensorStore raise many kinds, for a full disk too
             with contextlib.suppress(OSError):  # its threads may still write into it
                 files.remove_partial(self.folder)
@@ -144,26 +147,22 @@ class Checkpoints:
         Raises:
           ValueError: there is no checkpoint, or none can be read.
         """
-        state, meta = self._read(None)
-        return Snapshot(
-            weights=state["params"],
-            updates=int(state["updates"]),
-            episodes=int(state["episodes"]),
-            seconds=float(meta["seconds"]),
-            point=0,
-            data_version=meta["data_version"],
-        )
+        return self._read(None)
 
     def _steps(self) -> list[int]:
         """The complete checkpoints, newest first."""
+        regular.check_folder(self.folder)
         names = (path.name for path in self.folder.glob("*") if path.is_dir())
-        return sorted((int(name) for name in names if name.isdecimal()), reverse=True)
+        found = (int(name) for name in names if name.isdecimal() and str(int(name)) == name)
+        return sorted(found, reverse=True)
 
-    def _read(self, blank: Any) -> tuple[Any, dict[str, Any]]:
+    def _read(self, blank: Any) -> Any:
         faults: list[Exception] = []
         for step in self._steps():
+            path = self.folder / str(step)
             try:
-                found = self._read_one(self.folder / str(step), blank)
+                found = self._read_one(path, blank)
+                found = _snapshot(path, *found) if blank is None else found
             except NewerFormat:
                 raise  # it is sound: no older one may replace it
             except (ValueError, OSError) as error:
@@ -175,17 +174,21 @@ class Checkpoints:
         raise faults[0] if faults else ValueError(f"{self.folder}: no checkpoint")
 
     def _read_one(self, path: Path, blank: Any) -> tuple[Any, dict[str, Any]]:
+        size = regular.check_tree(path)
         _verify(path)
         try:
             meta = self._orbax.restore(path, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
             written = meta["meta"]["format"]
             if written <= FORMAT:
+                described = _leaves(self._arrays.metadata(path / "state").tree, written)
+                _check_budgets(described, size)
+                if blank is not None:
+                    _fitted(described, blank)
                 read = self._orbax.restore(
                     path, args=ocp.args.Composite(state=ocp.args.StandardRestore())
                 )
-                leaves = jax.tree_util.tree_leaves_with_path(read["state"])
-                found = renamed({_name(place): leaf for place, leaf in leaves}, written)
-                state = _nested(found) if blank is None else _fitted(found, blank)
+                found = {n: np.asarray(x) for n, x in _leaves(read["state"], written).items()}
+                state = history.nested(path, found) if blank is None else _fitted(found, blank)
         except Exception as error:  # Orbax raises many kinds for a damaged folder
             raise ValueError(f"{path}: unreadable checkpoint ({_reason(error)})") from error
         if written > FORMAT:
@@ -196,9 +199,42 @@ class Checkpoints:
         return state, dict(meta["meta"])
 
 
-def _nested(found: Mapping[str, Any]) -> Any:
-    """Nested dictionaries from leaves by name."""
-    return traverse_util.unflatten_dict(found, sep="/")
+def _snapshot(path: Path, state: Any, meta: Mapping[str, Any]) -> Snapshot:
+    """The network and the progress in a checkpoint."""
+    counts = {name: state.get(name) for name in ("updates", "episodes")}
+    if any(getattr(count, "shape", None) != () for count in counts.values()):
+        raise FileError(path, "has no updates or episodes")
+    weights = state.get("params")
+    if not isinstance(weights, dict):
+        raise FileError(path, "has no params")
+    return history.snapshot(
+        path,
+        weights,
+        point=0,
+        **{name: count.item() for name, count in counts.items()},
+        **{name: meta.get(name) for name in ("seconds", "data_version")},
+    )
+
+
+def _leaves(tree: Any, written: int) -> dict[str, Any]:
+    """Leaves by the names of today, from a checkpoint of format `written`."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return renamed({_name(place): leaf for place, leaf in leaves}, written)
+
+
+def _check_budgets(described: Mapping[str, Any], size: int) -> None:
+    """Raises ValueError if arrays that a checkpoint describes are too many or too large to read.
+
+    Args:
+      described: shape, dtype and storage of each; nothing of it has been read yet.
+      size: bytes of the checkpoint's files.
+    """
+    unpacked = 0
+    for array in described.values():
+        shapes = array.shape, getattr(array.storage, "chunk_shape", None) or ()
+        unpacked += max(map(math.prod, shapes)) * np.dtype(array.dtype).itemsize
+    if reason := unpacking_excess(len(described), unpacked, size):
+        raise ValueError(reason)
 
 
 def _fitted(found: Mapping[str, Any], blank: Any) -> Any:
@@ -217,9 +253,7 @@ def _fitted(found: Mapping[str, Any], blank: Any) -> Any:
         one, other = (f"{x.dtype}{x.shape}" for x in (found[name], leaf))
         if one != other:
             raise ValueError(f"{name} is {one}, not {other}")
-    return jax.tree.unflatten(
-        jax.tree.structure(blank), [np.asarray(found[name]) for name in wanted]
-    )
+    return jax.tree.unflatten(jax.tree.structure(blank), [found[name] for name in wanted])
 
 
 def _name(path: tuple[Any, ...]) -> str:
