@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from tdanet_jax.io.untrusted import FileError
+from tdanet_jax.io.untrusted import FileError, regular
 from tdanet_jax.scenes.scene import SceneError
 from tdanet_jax.splits import ITHOR_ROOMS, PARTS, SCENE_NUMBERS, TRAIN_SCENES_PER_TYPE
 from tdanet_jax.vocabulary import ROOM_TYPES, class_words
@@ -17,7 +17,6 @@ from tdanet_jax.vocabulary import ROOM_TYPES, class_words
 #: Bytes of UTF-8: names of rooms become names of files.
 LONGEST_NAME = 200
 COLUMNS = ("name", "room_type", "part")
-LARGEST_TABLE = 16 << 20  # bytes
 
 _ITHOR = re.compile(r"FloorPlan([1-9][0-9]{0,2})(?![0-9])")
 
@@ -124,14 +123,11 @@ def read_table(path: Path) -> dict[str, RoomKind]:
       FileError: it is not such a table; the message names line and column.
     """
     try:
-        if path.stat().st_size > LARGEST_TABLE:
-            raise FileError(path, f"larger than {LARGEST_TABLE >> 20} MiB")
-        # utf-8-sig: spreadsheets write a mark at the start.
-        rows = csv.reader(path.read_text(encoding="utf-8-sig").splitlines(), strict=True)
+        rows = csv.reader(regular.read_text(path).splitlines(), strict=True)
         lines = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
     except OSError as error:
         raise FileError(path, error.strerror) from None
-    except (UnicodeDecodeError, csv.Error) as error:
+    except csv.Error as error:
         raise FileError(path, f"not a CSV table ({error})") from None
     header = lines[0][1] if lines else []
     if len(set(header)) != len(header) or not {"name"} <= set(header) <= {*COLUMNS}:

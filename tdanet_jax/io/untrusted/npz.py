@@ -16,7 +16,7 @@ from tdanet_jax.io.untrusted import FileError, regular
 from tdanet_jax.io.untrusted.budgets import unpacking_excess
 
 #: What NumPy writes; other methods expand far more.
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _BLOCK = 1 << 20  # bytes
 
 
@@ -54,7 +54,7 @@ def _opened(path: Path, links: bool) -> Iterator[zipfile.ZipFile]:
             if reason := unpacking_excess(len(entries), unpacked, os.fstat(file.fileno()).st_size):
                 raise FileError(path, reason)
             for entry in entries:
-                if entry.compress_type not in _METHODS:
+                if entry.compress_type not in METHODS:
                     raise FileError(path, f"{entry.filename} is packed by an unsupported method")
             yield archive
     except FileNotFoundError:

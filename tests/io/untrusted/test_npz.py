@@ -72,7 +72,7 @@ def test_sizes_are_added_up_before_anything_is_unpacked(tmp_path: Path) -> None:
         for name in range(5):
             archive.writestr(f"{name}.npy", zeros)
     tracemalloc.start()
-    with pytest.raises(FileError, match="unpacks to 1.* times its size, more than 200"):
+    with pytest.raises(FileError, match=r"unpacks to 1.* times its size, more than 200"):
         npz.read(path)
     assert tracemalloc.get_traced_memory()[1] < 1 << 20
     tracemalloc.stop()
@@ -90,7 +90,7 @@ def test_an_array_is_read_once_and_not_copied(tmp_path: Path) -> None:
 def test_too_many_arrays_and_other_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TDANET_BUDGETS", "arrays=2")
     path = packed(tmp_path / "a.npz", **{f"{i}.npy": npy(np.zeros(3)) for i in range(3)})
-    with pytest.raises(FileError, match="3 arrays, more than 2; .* TDANET_BUDGETS=arrays=3"):
+    with pytest.raises(FileError, match=r"3 arrays, more than 2; .* TDANET_BUDGETS=arrays=3"):
         npz.read(path)
     for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):  # they expand a million-fold
         with zipfile.ZipFile(path, "w", method) as archive:
