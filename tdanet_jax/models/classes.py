@@ -96,21 +96,21 @@ def load_vocabulary(run: Path) -> ClassVocabulary:
     values = jsons.load(path, links=False)
     if not isinstance(values, dict):
         raise FileError(path, "not a vocabulary")
-    names, known, edges = (values.get(field) for field in ("names", "known", "edges"))
+    names, known, edges = (values.get(f, []) for f in ("names", "known", "edges"))
     if not isinstance(names, list) or len(names) > MOST_NAMES:
         raise FileError(path, f"names: not a list of up to {MOST_NAMES} classes")
     if not all(isinstance(name, str) and name.isprintable() for name in names):
         raise FileError(path, "names: a class that is not a line of text")
     if not _are_among(known, range(len(names))) or len(set(known)) < len(known):
         raise FileError(path, "known: not a list of different indices of names")
-    if not isinstance(edges or [], list):
+    if not isinstance(edges, list):  # the first versions wrote none
         raise FileError(path, "edges: not a list")
-    for edge in edges or []:  # the first versions wrote none
+    for edge in edges:
         if not isinstance(edge, list) or len(edge) != 3 or not _are_among(edge[:2], known):
             raise FileError(path, "edges: not two indices of known classes and a weight each")
         if number(path, edge[2], "edges: a weight", 1e9) < 0:
             raise FileError(path, "edges: a weight below 0")
-    triples = tuple((i, j, float(weight)) for i, j, weight in edges or ())
+    triples = tuple((i, j, float(weight)) for i, j, weight in edges)
     return ClassVocabulary(tuple(names), tuple(known), triples)
 
 

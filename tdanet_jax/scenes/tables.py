@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from tdanet_jax.io import archive
-from tdanet_jax.io.untrusted import npz
+from tdanet_jax.io.untrusted import jsons, npz
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene, SceneError, SceneObject
 from tdanet_jax.vocabulary import FIELD_OF_VIEW, IMAGE_SIZE, ROOM_TYPES
@@ -219,7 +219,7 @@ class SceneTables:
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> SceneTables:
         """The tables from `to_arrays`; arrays with a slash in their names are ignored."""
         own: dict[str, Any] = {name: a for name, a in arrays.items() if "/" not in name}
-        rest = json.loads(own.pop("rest").tobytes())
+        rest = jsons.parse("rest", own.pop("rest").tobytes().decode())
         fields: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in rest.items()
         }

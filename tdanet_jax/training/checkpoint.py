@@ -161,8 +161,8 @@ class Checkpoints:
         for step in self._steps():
             path = self.folder / str(step)
             try:
-                found = self._read_one(path, blank)
-                found = _snapshot(path, *found) if blank is None else found
+                read = self._read_one(path, blank)
+                found = _snapshot(path, *read) if blank is None else read
             except NewerFormat:
                 raise  # it is sound: no older one may replace it
             except (ValueError, OSError) as error:

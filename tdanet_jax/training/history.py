@@ -92,19 +92,21 @@ def read(path: Path) -> Snapshot:
         it.
     """
     content = npz.read(path, links=False)
-    where = {name: content.pop(f"@{name}", None) for name in (*_WHERE, "format")}
-    if any(value is None or value.shape != () for value in where.values()):
-        raise FileError(path, "not a point of a run's history")
-    written = jsons.number(path, where.pop("format").item(), "format", 1e9)
+    progress: dict[str, Any] = {}
+    for name in (*_WHERE, "format"):
+        value = content.pop(f"@{name}", None)
+        if value is None or value.shape != ():
+            raise FileError(path, "not a point of a run's history")
+        progress[name] = value.item()
+    written = int(jsons.number(path, progress.pop("format"), "format", 1e9))
     if written > FORMAT:
         raise FileError(
-            path, f"format {written:.0f}, this version reads {FORMAT}: a newer tdanet_jax wrote it"
+            path, f"format {written}, this version reads {FORMAT}: a newer tdanet_jax wrote it"
         )
     for name, array in content.items():
         if array.dtype.kind != "f":
             raise FileError(path, f"{name} is not a parameter")
     content = {name: array.astype(np.float32) for name, array in content.items()}
-    progress = {name: value.item() for name, value in where.items()}
     return snapshot(path, nested(path, renamed(content, written)), **progress)
 
 

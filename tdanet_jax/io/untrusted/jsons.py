@@ -19,16 +19,17 @@ _STRINGS = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
 _NOT_BRACKETS = re.compile(r"[^\[\]{}]++")
 
 
-def load(path: Path, links: bool = True) -> Any:
-    """The content of a JSON file; NaN and Infinity are refused.
+def load(path: Path, links: bool = True, nan: bool = False) -> Any:
+    """The content of a JSON file.
 
     Args:
       links: whether `path` may be a link, as a file that the user named may be.
+      nan: whether NaN and Infinity, which are not JSON, are accepted.
 
     Raises:
       FileError: the file is missing, not JSON, or exceeds a budget.
     """
-    return parse(path, _text(path, links))
+    return parse(path, _text(path, links), nan)
 
 
 def load_lines(path: Path, links: bool = True) -> Iterator[tuple[int, Any]]:
@@ -40,15 +41,15 @@ def load_lines(path: Path, links: bool = True) -> Iterator[tuple[int, Any]]:
             yield number, None
 
 
-def parse(path: Path | str, text: str) -> Any:
-    """The value of a JSON text; NaN and Infinity are refused.
+def parse(path: Path | str, text: str, nan: bool = False) -> Any:
+    """The value of a JSON text; NaN and Infinity are refused unless `nan`.
 
     Raises:
       FileError: it is not JSON, or exceeds a budget; the message begins with `path`.
     """
     _check_nesting(path, text)
     try:
-        return _decoder().decode(text)
+        return (json.JSONDecoder() if nan else _decoder()).decode(text)
     except (ValueError, RecursionError) as error:
         raise FileError(path, f"not JSON ({error})") from None
 

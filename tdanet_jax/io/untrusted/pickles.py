@@ -320,8 +320,9 @@ def array(value: Any, path: object, most: int = LARGEST) -> np.ndarray:
 
 def _numpy_array(value: Call, most: int) -> np.ndarray:
     _, shape, dtype, by_column, data = value.state
-    code, order = dtype.arguments[0], dtype.state[1]
-    if not isinstance(code, str) or not isinstance(order, str):  # hashing others may take for ever
+    code: Any = dtype.arguments[0]
+    order: Any = dtype.state[1]
+    if not isinstance(code, str):  # hashing a tuple of tuples may take for ever
         raise ValueError("not numeric")
     if dtype.name != _DTYPE or code not in _NUMBERS or order not in ("<", ">", "|", "="):
         raise ValueError("not numeric")
@@ -338,13 +339,13 @@ _NUMBERS = {f"{kind}{size}" for kind, sizes in (("f", "248"), ("iu", "1248")) fo
 def _octets(data: Any, most: int) -> bytes:
     """The bytes of up to `most` numbers, and of the pickles around them; pickles of protocol 2
     write bytes as text in latin-1 and a call that encodes it."""
-    encoded = isinstance(data, Call) and data.name == _BYTES and data.arguments[1:] == ("latin1",)
-    content = data.arguments[0] if encoded else data
-    if not isinstance(content, str if encoded else bytes):
+    if isinstance(data, Call) and data.name == _BYTES and data.arguments[1:] == ("latin1",):
+        data = data.arguments[0]
+    if not isinstance(data, bytes | str):
         raise ValueError("not bytes")
-    if len(content) > 16 * most + 4096:  # before anything is copied
+    if len(data) > 16 * most + 4096:  # before anything is copied
         raise ValueError("too large")
-    return content.encode("latin-1") if encoded else content
+    return data.encode("latin-1") if isinstance(data, str) else data
 
 
 def _tensor(value: Call, path: object, most: int) -> np.ndarray:
