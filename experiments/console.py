@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from experiments.signals import Stopped, StopRequest
+from tdanet_jax.io.escaping import in_line, in_terminal
 from tdanet_jax.splits import GROUPS
 
 Arguments = TypeVar("Arguments")
@@ -25,13 +26,21 @@ Arguments = TypeVar("Arguments")
 #: Without a terminal, progress is a line at most this often.
 SECONDS_BETWEEN_LINES = 10.0
 
-#: Without markup: names from files may hold brackets.
-console = Console(stderr=False, highlight=False, soft_wrap=True, markup=False)
+
+class _PlainConsole(Console):
+    """Prints names from files as they are: without markup or control characters."""
+
+    def print(self, *texts: object, **options: Any) -> None:
+        plain = (in_terminal(text) if isinstance(text, str) else text for text in texts)
+        super().print(*plain, **options)
+
+
+console = _PlainConsole(stderr=False, highlight=False, soft_wrap=True, markup=False)
 
 
 def fail(message: object) -> NoReturn:
     """Ends the program with one line on standard error and exit status 2."""
-    print(f"error: {message}", file=sys.stderr)
+    print(f"error: {in_line(message)}", file=sys.stderr)
     raise SystemExit(2)
 
 
@@ -78,7 +87,7 @@ def one_line_errors() -> Iterator[None]:
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
-    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+    print(f"warning: {in_line(message)}", file=sys.stderr)
 
 
 def check_new_file(path: Path, in_folder: bool = True) -> None:
@@ -139,7 +148,7 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
             task = bar.add_task(title, total=1.0, figures="")
 
             def live(share: float, figures: str) -> None:
-                bar.update(task, completed=min(share, 1.0), figures=figures)
+                bar.update(task, completed=min(share, 1.0), figures=in_line(figures))
 
             yield live
         return

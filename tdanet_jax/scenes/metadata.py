@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from tdanet_jax.io.escaping import in_line
 from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.poses import ITHOR, TURNS, PoseGrid
 from tdanet_jax.scenes.room_names import Kinds, RoomKind, check_kind, check_name
@@ -168,8 +169,17 @@ def read_scenes(path: Path, kinds: Kinds | None = None) -> list[Scene]:
       kinds: room types and parts of the rooms for which the file does not say them.
 
     Raises:
-      SceneError: it is not such a file, or a scene breaks a rule.
+      SceneError: it is not such a file, or a scene breaks a rule; the message begins with the path.
     """
+    try:
+        return _read_scenes(path, kinds or Kinds())
+    except SceneError as error:
+        if str(error).startswith(in_line(path)):
+            raise
+        raise SceneError(f"{path}: {error}") from None
+
+
+def _read_scenes(path: Path, kinds: Kinds) -> list[Scene]:
     try:
         content = jsons.load(path, nan=True)  # in fields that are not read
     except FileError as error:
@@ -177,7 +187,6 @@ def read_scenes(path: Path, kinds: Kinds | None = None) -> list[Scene]:
     documents = content if isinstance(content, list) else [content]
     if not documents:
         raise SceneError(f"{path}: no scenes")
-    kinds = kinds or Kinds()
     names = [document.get("name") for document in documents if isinstance(document, Mapping)]
     if unknown := [name for name in kinds.table if name not in names]:
         raise SceneError(f"{path}: no room is called {unknown[0]}, which --rooms lists")

@@ -15,6 +15,7 @@ from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.evaluation import episodes, policies, report, rollout
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import regular
 from tdanet_jax.models.factory import unused_flags
 from tdanet_jax.task import Task, load_task, resolve
 from tdanet_jax.training import checkpoint, devices
@@ -120,7 +121,9 @@ def _prepare(
     folder: Path, config: TrainConfig, task: Task, resume: bool, callbacks: Callbacks
 ) -> None:
     """Writes what a run's folder holds from the start."""
-    if not resume:
+    if resume:
+        regular.check_tree(folder)  # where a link leads, nothing is written or deleted
+    else:
         files.check_empty(folder, f" (to continue there: --resume {folder})")
     for path in files.remove_partial(folder) + files.remove_partial(folder / checkpoint.FOLDER):
         callbacks.on_note(f"removed {path}: half-written when the run was stopped")

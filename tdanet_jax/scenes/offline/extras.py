@@ -155,7 +155,7 @@ def read_episodes(
         if reason := _misfit(episode, rooms.get(episode.scene)):
             key = state_key(episode.x, episode.z, episode.rotation, episode.horizon)
             name = f"episode {i} of {path.name} ({episode.scene:.40} {key} {episode.target:.40})"
-            others[reason].append("".join(c if c.isprintable() else "?" for c in name))
+            others[reason].append(name)
         else:
             found.append(episode)
     return found, others
