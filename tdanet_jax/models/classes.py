@@ -96,14 +96,16 @@ def load_vocabulary(run: Path) -> ClassVocabulary:
     values = jsons.load(path, links=False)
     if not isinstance(values, dict):
         raise FileError(path, "not a vocabulary")
-    names, known, edges = (values.get(f, []) for f in ("names", "known", "edges"))
+    names: Any = values.get("names")
+    known: Any = values.get("known")
+    edges: Any = values.get("edges", [])  # the first versions wrote none
     if not isinstance(names, list) or len(names) > MOST_NAMES:
         raise FileError(path, f"names: not a list of up to {MOST_NAMES} classes")
     if not all(isinstance(name, str) and name.isprintable() for name in names):
         raise FileError(path, "names: a class that is not a line of text")
     if not _are_among(known, range(len(names))) or len(set(known)) < len(known):
         raise FileError(path, "known: not a list of different indices of names")
-    if not isinstance(edges, list):  # the first versions wrote none
+    if not isinstance(edges, list):
         raise FileError(path, "edges: not a list")
     for edge in edges:
         if not isinstance(edge, list) or len(edge) != 3 or not _are_among(edge[:2], known):

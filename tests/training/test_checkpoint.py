@@ -212,3 +212,42 @@ def test_a_checkpoint_of_another_network_is_refused(saved: Checkpoints) -> None:
     config = dataclasses.replace(LearnerConfig(), num_envs=4)
     with pytest.raises(ValueError, match="unreadable checkpoint"):
         saved.restore(lambda: init(jax.random.key(0), config, wider, WORDS, PARAMS))
+
+
+@pytest.mark.parametrize("budget", ["unpacked=1000", "arrays=3"])
+def test_budgets_hold_before_any_array_is_read(
+    saved: Checkpoints, monkeypatch: pytest.MonkeyPatch, budget: str
+) -> None:
+    def read(*_: object, **__: object) -> None:
+        raise AssertionError("the arrays are read")
+
+    monkeypatch.setattr(checkpoint.ocp.args, "StandardRestore", read)
+    monkeypatch.setenv("TDANET_BUDGETS", budget)
+    with pytest.raises(ValueError, match=r"2: unreadable checkpoint \(.* more than \d+; if"):
+        saved.snapshot()
+
+
+def test_the_shapes_of_another_network_are_seen_before_any_array_is_read(
+    saved: Checkpoints, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(*_: object, **__: object) -> None:
+        raise AssertionError("the arrays are read")
+
+    monkeypatch.setattr(checkpoint.ocp.args, "StandardRestore", read)
+    config = LearnerConfig(num_envs=4)
+    with pytest.raises(ValueError, match=r"unreadable checkpoint \(.* is float32\(.*, not"):
+        saved.restore(lambda: init(jax.random.key(0), config, network(9), WORDS, PARAMS))
+
+
+@pytest.mark.parametrize(
+    "meta",
+    [{}, {"seconds": "1", "data_version": "d"}, {"seconds": 10**400, "data_version": "d"},
+     {"seconds": -1.0, "data_version": "d"}, {"seconds": 1.0}, {"seconds": 1.0, "data_version": 3},
+     {"seconds": 1.0, "data_version": "\x1b[2J"}],
+)  # fmt: skip
+def test_odd_progress_is_one_clear_line(tmp_path: Path, meta: dict) -> None:
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(after(1), meta)
+    with pytest.raises(ValueError, match=r"checkpoints/1: (seconds|data_version) is ") as caught:
+        checkpoints.snapshot()
+    assert str(caught.value).isprintable()
