@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 FORMAT = 2
 FOLDER = "checkpoints"
 CHECKSUMS = "SHA256SUMS"
+#: Bytes up to which a checkpoint may expand by any factor: much of a state is zero at first.
+FREE = 1 << 30
 KEPT = 2
 
 # Orbax logs every file it touches, and every error that it also raises.
@@ -183,7 +185,7 @@ class Checkpoints:
                 described = _leaves(self._arrays.metadata(path / "state").tree, written)
                 _check_budgets(described, size)
                 if blank is not None:
-                    _fitted(described, blank)
+                    _fitted(described, blank)  # its shapes, before anything is read
                 read = self._orbax.restore(
                     path, args=ocp.args.Composite(state=ocp.args.StandardRestore())
                 )
@@ -233,7 +235,7 @@ def _check_budgets(described: Mapping[str, Any], size: int) -> None:
     for array in described.values():
         shapes = array.shape, getattr(array.storage, "chunk_shape", None) or ()
         unpacked += max(map(math.prod, shapes)) * np.dtype(array.dtype).itemsize
-    if reason := unpacking_excess(len(described), unpacked, size):
+    if reason := unpacking_excess(len(described), unpacked, size, FREE):
         raise ValueError(reason)
 
 

@@ -175,7 +175,8 @@ def points(run: Path) -> list[Path]:
 
 def drop_after(run: Path, updates: int) -> None:
     """Deletes the points after a checkpoint: their updates will be done again."""
+    found = points(run)  # an error if the folder is a link
     files.remove_partial(run / FOLDER)
-    for path in points(run):
+    for path in found:
         if int(path.stem) > updates:
             path.unlink()
