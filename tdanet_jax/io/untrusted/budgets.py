@@ -30,7 +30,7 @@ class Budgets:
     patches: float = 1e6
     """Patches on the surfaces of a room's objects, in which visibility is computed."""
     tests: float = 1e12
-    """Pairs of a line of sight and a box of one room; 10^12 take about an hour."""
+    """Pairs of a line of sight and a box of one room; 10^12 take about half an hour."""
 
 
 def budgets() -> Budgets:
