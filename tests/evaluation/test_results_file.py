@@ -22,7 +22,8 @@ def test_what_an_evaluation_wrote_is_read() -> None:
 @pytest.mark.parametrize(
     ("place", "value"),
     [
-        ("split", "../../escaped"), ("split", "../../Mug"), ("split", "14/8,"), ("split", None), ("model", 3),
+        ("split", "../../escaped"), ("split", "../../Mug"), ("split", "14/8,"),
+        ("split", None), ("model", 3),
         ("policy", "a\x1b[2J"), ("data_version", None), ("seed", -1), ("seed", 0.5),
         ("seed", 10**400), ("steps", "many"), ("episodes_trained", True), ("data", 3),
         ("seen", None), ("seen", []), ("seen/L>=1", None), ("seen/L>=1/SR", 1e308),
