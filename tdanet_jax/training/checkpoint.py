@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import logging
-import math
 import os
 import shutil
 import sys
@@ -26,7 +25,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from tdanet_jax.io import assets, files
-from tdanet_jax.io.untrusted import FileError, regular
+from tdanet_jax.io.untrusted import FileError, jsons, orbax, regular
 from tdanet_jax.io.untrusted.budgets import unpacking_excess
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
@@ -39,8 +38,6 @@ if TYPE_CHECKING:
 FORMAT = 2
 FOLDER = "checkpoints"
 CHECKSUMS = "SHA256SUMS"
-#: Bytes up to which a checkpoint may expand by any factor: much of a state is zero at first.
-FREE = 1 << 30
 KEPT = 2
 
 # Orbax logs every file it touches, and every error that it also raises.
@@ -78,11 +75,10 @@ class Checkpoints:
         # Every process reads for itself, and one alone writes: none waits for the others.
         here = jax.process_index()
         alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
-        self._arrays = ocp.StandardCheckpointHandler(multiprocessing_options=alone)
         self._orbax = ocp.Checkpointer(
             ocp.CompositeCheckpointHandler(
                 composite_options=ocp.CompositeOptions(multiprocessing_options=alone),
-                state=self._arrays,
+                state=ocp.StandardCheckpointHandler(multiprocessing_options=alone),
                 meta=ocp.JsonCheckpointHandler(multiprocessing_options=alone),
             ),
             multiprocessing_options=alone,
@@ -179,26 +175,30 @@ class Checkpoints:
         size = regular.check_tree(path)
         _verify(path)
         try:
-            meta = self._orbax.restore(path, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
-            written = meta["meta"]["format"]
+            meta = jsons.load(path / "meta" / "metadata", links=False)
+            written = meta["format"]
             if written <= FORMAT:
-                described = _leaves(self._arrays.metadata(path / "state").tree, written)
-                _check_budgets(described, size)
-                if blank is not None:
+                described = renamed(orbax.describe(path / "state"), written)
+                if blank is None:
+                    described = {n: one for n, one in described.items() if _is_of_network(n)}
+                    _check_budgets(described, size)
+                else:
                     _fitted(described, blank)  # its shapes, before anything is read
-                read = self._orbax.restore(
-                    path, args=ocp.args.Composite(state=ocp.args.StandardRestore())
-                )
-                found = {n: np.asarray(x) for n, x in _leaves(read["state"], written).items()}
+                found = {name: one.read() for name, one in described.items()}
                 state = history.nested(path, found) if blank is None else _fitted(found, blank)
-        except Exception as error:  # Orbax raises many kinds for a damaged folder
+        except Exception as error:  # a damaged folder has many kinds of faults
             raise ValueError(f"{path}: unreadable checkpoint ({_reason(error)})") from error
         if written > FORMAT:
             raise NewerFormat(
                 f"{path}: checkpoint of format {written}, this version reads up to {FORMAT}: "
                 "a newer tdanet_jax wrote it"
             )
-        return state, dict(meta["meta"])
+        return state, meta
+
+
+def _is_of_network(name: str) -> bool:
+    """Whether an array of a state is needed for the network alone."""
+    return name.startswith("params/") or name in ("updates", "episodes")
 
 
 def _snapshot(path: Path, state: Any, meta: Mapping[str, Any]) -> Snapshot:
@@ -218,24 +218,14 @@ def _snapshot(path: Path, state: Any, meta: Mapping[str, Any]) -> Snapshot:
     )
 
 
-def _leaves(tree: Any, written: int) -> dict[str, Any]:
-    """Leaves by the names of today, from a checkpoint of format `written`."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return renamed({_name(place): leaf for place, leaf in leaves}, written)
-
-
-def _check_budgets(described: Mapping[str, Any], size: int) -> None:
-    """Raises ValueError if arrays that a checkpoint describes are too many or too large to read.
+def _check_budgets(described: Mapping[str, orbax.Stored], size: int) -> None:
+    """Raises ValueError if arrays are too many or too large to be read.
 
     Args:
-      described: shape, dtype and storage of each; nothing of it has been read yet.
       size: bytes of the checkpoint's files.
     """
-    unpacked = 0
-    for array in described.values():
-        shapes = array.shape, getattr(array.storage, "chunk_shape", None) or ()
-        unpacked += max(map(math.prod, shapes)) * np.dtype(array.dtype).itemsize
-    if reason := unpacking_excess(len(described), unpacked, size, FREE):
+    unpacked = sum(one.size for one in described.values())
+    if reason := unpacking_excess(len(described), unpacked, size):
         raise ValueError(reason)
 
 

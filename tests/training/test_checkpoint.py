@@ -18,6 +18,7 @@ import pytest
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import orbax
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.factory import make_model
@@ -221,7 +222,7 @@ def test_budgets_hold_before_any_array_is_read(
     def read(*_: object, **__: object) -> None:
         raise AssertionError("the arrays are read")
 
-    monkeypatch.setattr(checkpoint.ocp.args, "StandardRestore", read)
+    monkeypatch.setattr(orbax.Stored, "read", read)
     monkeypatch.setenv("TDANET_BUDGETS", budget)
     with pytest.raises(ValueError, match=r"2: unreadable checkpoint \(.* more than \d+; if"):
         saved.snapshot()
@@ -233,7 +234,7 @@ def test_the_shapes_of_another_network_are_seen_before_any_array_is_read(
     def read(*_: object, **__: object) -> None:
         raise AssertionError("the arrays are read")
 
-    monkeypatch.setattr(checkpoint.ocp.args, "StandardRestore", read)
+    monkeypatch.setattr(orbax.Stored, "read", read)
     config = LearnerConfig(num_envs=4)
     with pytest.raises(ValueError, match=r"unreadable checkpoint \(.* is float32\(.*, not"):
         saved.restore(lambda: init(jax.random.key(0), config, network(9), WORDS, PARAMS))

@@ -25,8 +25,7 @@ class Budgets:
     unpacked: float = 4 << 30
     """Bytes of all these arrays together."""
     expansion: float = 200
-    """Unpacked bytes per byte of a file that unpacks to more than 64 MiB, of a checkpoint to more
-    than 1 GiB. Rooms expand 3-fold; states that are zero at first expand without limit."""
+    """Unpacked bytes per byte of a file that unpacks to more than 64 MiB. Rooms expand 3-fold."""
     patches: float = 1e6
     """Patches on the surfaces of a room's objects, in which visibility is computed."""
     tests: float = 1e12
@@ -61,13 +60,9 @@ def excess(name: str, amount: float, what: str) -> str:
     return f"{what}, more than {most:.15g}; if you trust the file, set {VARIABLE}={name}={amount:g}"
 
 
-def unpacking_excess(arrays: int, unpacked: int, packed: int, free: int = 64 << 20) -> str:
-    """Why arrays of so many bytes are not unpacked from so many bytes of a file; or "".
-
-    Args:
-      free: bytes up to which the file may expand by any factor.
-    """
-    factor = 0.0 if unpacked <= free else unpacked / max(packed, 1)
+def unpacking_excess(arrays: int, unpacked: int, packed: int) -> str:
+    """Why arrays of so many bytes are not unpacked from so many bytes of a file; or ""."""
+    factor = 0.0 if unpacked <= 64 << 20 else unpacked / max(packed, 1)
     return (
         excess("arrays", arrays, f"{arrays} arrays")
         or excess("unpacked", unpacked, f"unpacks to {unpacked} bytes")
