@@ -9,9 +9,14 @@ from typing import Any
 _MARKDOWN = re.compile(r"([\\`*\[\]|])")
 
 
+def in_name(text: object) -> str:
+    """A name without control characters, which a terminal would obey, and without line breaks."""
+    return "".join(c if c.isprintable() else "?" for c in str(text))
+
+
 def in_terminal(text: object) -> str:
-    """Text without control characters, which a terminal would obey; lines stay apart."""
-    return "".join(c if c.isprintable() or c == "\n" else "?" for c in str(text))
+    """Text for a terminal; its lines stay apart."""
+    return "\n".join(map(in_name, str(text).split("\n")))
 
 
 def in_line(text: object, longest: int | None = None) -> str:

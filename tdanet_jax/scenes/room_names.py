@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from tdanet_jax.io.escaping import in_terminal
+from tdanet_jax.io.escaping import in_name
 from tdanet_jax.io.untrusted import FileError, regular
 from tdanet_jax.scenes.scene import SceneError
 from tdanet_jax.splits import ITHOR_ROOMS, PARTS, SCENE_NUMBERS, TRAIN_SCENES_PER_TYPE
@@ -39,7 +39,7 @@ def check_name(name: str, what: str = "room name") -> None:
       SceneError: the name is empty, too long, begins or ends with a space, is "." or "..", or has a
         path separator (/, \\ or :) or a character that cannot be printed.
     """
-    shown = in_terminal(name[:40])
+    shown = in_name(name[:40])
     if not name.isprintable():
         raise SceneError(f"{what} {shown!r}: has a control character")
     if any(separator in name for separator in "/\\:") or name in (".", ".."):

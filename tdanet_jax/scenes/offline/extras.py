@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tdanet_jax.io.escaping import in_name
 from tdanet_jax.io.untrusted import FileError, jsons, pickles, regular
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
 from tdanet_jax.scenes.offline.layout import (
@@ -155,7 +156,7 @@ def read_episodes(
         if reason := _misfit(episode, rooms.get(episode.scene)):
             key = state_key(episode.x, episode.z, episode.rotation, episode.horizon)
             name = f"episode {i} of {path.name} ({episode.scene:.40} {key} {episode.target:.40})"
-            others[reason].append(name)
+            others[reason].append(in_name(name))
         else:
             found.append(episode)
     return found, others
