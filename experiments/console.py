@@ -23,6 +23,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from experiments.signals import Stopped, StopRequest
 from experiments.streams import ends_with_its_reader
 from tdanet_jax.io import files
+from tdanet_jax.io.escaping import in_line, in_terminal
 from tdanet_jax.splits import GROUPS
 
 Arguments = TypeVar("Arguments")
@@ -31,22 +32,28 @@ Arguments = TypeVar("Arguments")
 SECONDS_BETWEEN_LINES = 10.0
 
 
-class OurConsole(Console):
-    """A console that leaves it to us what happens when a pipe breaks."""
+class PlainConsole(Console):
+    """Prints names from files as they are, without markup or control characters, and leaves it to
+    us what happens when a pipe breaks.
+    """
+
+    def print(self, *texts: object, **options: Any) -> None:
+        """Prints as `Console` does."""
+        plain = (in_terminal(text) if isinstance(text, str) else text for text in texts)
+        super().print(*plain, **options)
 
     def on_broken_pipe(self) -> None:
         """Raises the error on, in place of ending the program."""
         raise
 
 
-#: Without markup: names from files may hold brackets.
-console = OurConsole(stderr=False, highlight=False, soft_wrap=True, markup=False)
+console = PlainConsole(stderr=False, highlight=False, soft_wrap=True, markup=False)
 
 
 def fail(message: object) -> NoReturn:
     """Ends the program with one line on standard error and exit status 2."""
     with contextlib.suppress(BrokenPipeError):
-        print(f"error: {message}", file=sys.stderr)
+        print(f"error: {in_line(message)}", file=sys.stderr)
     raise SystemExit(2)
 
 
@@ -130,7 +137,7 @@ def one_line_errors() -> Iterator[None]:
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
-    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+    print(f"warning: {in_line(message)}", file=sys.stderr)
 
 
 def check_new_file(path: Path, in_folder: bool = True) -> None:
@@ -207,7 +214,7 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
             task = bar.add_task(title, total=1.0, figures="")
 
             def live(share: float, figures: str) -> None:
-                bar.update(task, completed=min(share, 1.0), figures=figures)
+                bar.update(task, completed=min(share, 1.0), figures=in_line(figures))
 
             yield live
         return

@@ -92,7 +92,7 @@ class Reports(Callbacks):
         self._title = title
         console.quiet = not devices.is_lead()
 
-    def on_rooms(self, done: int, total: int) -> None:
+    def on_rooms(self, done: float, total: int) -> None:
         self._show("rooms", done / total, "rebuilt")
 
     def on_note(self, text: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import FileError, jsons, regular
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.registry import MODELS, SENSORS
 from tdanet_jax.splits import file_name, make_split, split_name
@@ -337,6 +337,17 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
         lambda value: value >= 0,
         "not be negative",
     ),
+    (
+        ("steps", "episodes", "minutes", "checkpoint_minutes", "max_skipped"),
+        lambda value: value <= 1e15,
+        "be at most 1e15",
+    ),
+    (
+        ("num_envs", "rollout_steps", "step_limit", "chunk_updates", "history"),
+        lambda value: value <= 1_000_000,
+        "be at most 1,000,000",
+    ),
+    (("width", "hidden"), lambda value: value <= 8192, "be at most 8192"),
     (("size_noise",), lambda value: 0 <= value <= 2, "be between 0 and 2"),
     (("gamma", "gae_lambda"), lambda value: 0 <= value <= 1, "be between 0 and 1"),
     (("dropout",), lambda value: 0 <= value < 1, "be at least 0 and below 1"),
@@ -364,7 +375,7 @@ def _fits(value: Any, kind: Any) -> bool:
     if get_args(kind):
         return any(_fits(value, one) for one in get_args(kind))
     if kind is float:
-        return isinstance(value, int | float) and math.isfinite(value)
+        return type(value) in (int, float) and abs(value) < 1e300
     return isinstance(value, kind) and isinstance(value, bool) == (kind is bool)
 
 
@@ -406,6 +417,9 @@ def from_json(values: Mapping[str, Any]) -> TrainConfig:
       ValueError: a field is missing, unknown or out of range.
     """
     try:
+        for name, value in {"config": values, "learner": values["learner"]}.items():
+            if not isinstance(value, Mapping):
+                raise TypeError(f"{name} is not an object")
         network = {"sensors": (), **values["network"]}
         network["sensors"] = tuple(network["sensors"])
         parts = {"learner": LearnerConfig(**values["learner"]), "network": NetworkConfig(**network)}
@@ -432,7 +446,7 @@ def load(path: Path | str) -> TrainConfig:
     """
     path = Path(path)
     try:
-        config = from_json(json.loads(files.read_text(path)))
+        config = from_json(jsons.parse(path, regular.read_text(path, links=False)))
         trusted = (*MODELS, *SENSORS, *sys.modules, *os.environ.get(TRUST, "").split(","))
         custom = {"model": (config.model,), "sensor": config.network.sensors}
         for kind, names in custom.items():
@@ -445,5 +459,7 @@ def load(path: Path | str) -> TrainConfig:
         raise ValueError(f"{path}: no such file; is this the folder of a run?") from None
     except OSError as error:  # the folder is a file, for example
         raise ValueError(f"{path}: {error.strerror}; is this the folder of a run?") from None
-    except (json.JSONDecodeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from None
+    except FileError:
+        raise
+    except ValueError as error:
+        raise FileError(path, error) from None

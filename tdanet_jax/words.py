@@ -24,6 +24,8 @@ ASSET = "words.npz"
 #: How many of the most frequent words are kept.
 ASSET_WORDS = 20_000
 LONGEST_LINE = 1 << 16  # bytes of a line of a text file of vectors
+WIDEST = 4096  # numbers in a vector
+MOST_NAMES = 20_000  # vectors in an HDF5 file
 #: Length that every class vector is scaled to. Raw means of GloVe vectors vary from 3 to 7.
 DEFAULT_NORM = 3.0
 
@@ -142,7 +144,7 @@ def _load_text(path: Path, wanted: Collection[str]) -> WordVectors:
     index: dict[str, int] = {}
     rows: list[np.ndarray] = []
     if not path.is_file():
-        raise FileError(path, "no such file")
+        raise FileError(path, "not a regular file" if path.exists() else "no such file")
     with path.open("rb") as file:
         if file.read(3) != codecs.BOM_UTF8:
             file.seek(0)
@@ -156,7 +158,9 @@ def _load_text(path: Path, wanted: Collection[str]) -> WordVectors:
                 raise FileError(path, f"line {number + 1} is not a word and its numbers") from None
             if number == 0 and len(row) == 1:
                 continue  # first line of word2vec: number of words, width
-            if len(row) == 0 or (rows and len(row) != len(rows[0])) or not np.isfinite(row).all():
+            if not 0 < len(row) <= WIDEST or (rows and len(row) != len(rows[0])):
+                raise FileError(path, f"line {number + 1} is not a word and its numbers")
+            if not np.isfinite(row).all():
                 raise FileError(path, f"line {number + 1} is not a word and its numbers")
             if word not in index:
                 index[word] = len(rows)
@@ -172,7 +176,9 @@ def _load_hdf5(path: Path) -> WordVectors:
     with hdf5.opened(path) as reader:
         for name in reader.names():
             row = reader.read(name).astype(np.float32)
-            if row.ndim != 1 or len(row) == 0 or (rows and row.shape != rows[0].shape):
+            if row.ndim != 1 or not 0 < len(row) <= WIDEST or len(rows) >= MOST_NAMES:
+                raise FileError(path, f"{name} is not a vector, or one of too many")
+            if rows and row.shape != rows[0].shape:
                 raise FileError(path, f"{name} is not a vector as wide as the others")
             if class_words(name):
                 index[" ".join(class_words(name))] = len(rows)

@@ -40,6 +40,10 @@ def test_paper_preset_has_the_reference_constants():
         (TrainConfig(model="cnn"), "--model cnn"),
         (TrainConfig(steps=0), "--steps 0"),
         (TrainConfig(minutes=-1.0), "--minutes -1.0"),
+        (TrainConfig(steps=10**400), "--steps 1000"),
+        (TrainConfig(network=NetworkConfig(width=10**9)), "--width 1000000000: must be at most"),
+        (TrainConfig(learner=LearnerConfig(step_limit=2**40)), "--step-limit 1099511627776"),
+        (TrainConfig(learner=LearnerConfig(learning_rate=10**400)), "--learning-rate 1000"),
         (TrainConfig(learner=LearnerConfig(num_envs=0)), "--num-envs 0"),
         (TrainConfig(learner=LearnerConfig(gamma=1.5)), "--gamma 1.5"),
         (TrainConfig(network=NetworkConfig(dropout=1.0)), "--dropout 1.0"),
@@ -89,7 +93,22 @@ def test_every_default_is_in_range():
         config.check()
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"split": "18/4"}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "{}",
+        '{"split": "18/4"}',
+        '{"learner": 3, "network": {}}',
+        '{"learner": {}, "network": []}',
+        '{"learner": {}, "network": {"sensors": 3}}',
+        '{"learner": {}, "network": {"sensors": [3]}}',
+        "[" * 100_000,
+        '{"split": 1e400}',
+    ],
+)
 def test_an_unreadable_config_file_is_named(tmp_path, text):
     path = tmp_path / "config.json"
     path.write_text(text)

@@ -109,7 +109,7 @@ USES: dict[str, Callable[[str, SceneTables], object]] = {
     "Checkpoints": lambda at, tables: Checkpoints(f"{at}/run").latest(),
     "history": lambda at, tables: (
         path := str(history.write(f"{at}/run", checkpoint.newest(f"{at}/run"))),
-        history.read(path), history.checksums(path), history.points(f"{at}/run"),
+        history.read(path), history.points(f"{at}/run"),
         history.drop_after(f"{at}/run", 0),
     ),
     "journal": lambda at, tables: (

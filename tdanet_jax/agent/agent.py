@@ -317,9 +317,10 @@ def load(
     path = find_word_vectors(config, folder_of(run), word_vectors)
     vectors = words.load_word_vectors(path, classes.names)
     agent = Agent(config, weights, vectors, classes, grid, synonyms)
+    shape = max(len(classes.names), 1), vectors.vectors.shape[1]
     if path is not None:
-        shape = max(len(classes.names), 1), vectors.vectors.shape[1]
         check_width(run, agent.model, weights, shape)
+    history.check_fit(Path(run), weights, agent.model.parameter_shapes(*shape))
     return agent
 
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import EnvParams, Observation
+from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
 
@@ -203,7 +204,7 @@ def markdown(pairs: ClassPairs, title: str, unseen: Iterable[str], per_target: i
     """
     unseen = set(unseen)
     lines = [
-        f"# {title}",
+        f"# {in_markdown(title)}",
         "",
         "Mean attention (percent) while looking for a target: on the target where it is in view, "
         "on other classes in frames without the target; in brackets what even weights would give. "
@@ -217,9 +218,10 @@ def markdown(pairs: ClassPairs, title: str, unseen: Iterable[str], per_target: i
     for target in dict.fromkeys(row["target"] for row in rows):
         found = [r for r in rows if r["target"] == target and r["frames"] >= MIN_FRAMES]
         own = [_percent(r) for r in found if r["class"] == target] or ["-"]
-        others = [f"{r['class']} {_percent(r)}" for r in found if r["class"] != target]
+        rest = (row for row in found if row["class"] != target)
+        others = [f"{in_markdown(row['class'])} {_percent(row)}" for row in rest]
         cells = (others + [""] * per_target)[:per_target]
-        lines.append(f"| {target}{'*' if target in unseen else ''} | {own[0]} | ")
+        lines.append(f"| {in_markdown(target)}{'*' if target in unseen else ''} | {own[0]} | ")
         lines[-1] += " | ".join(cells) + " |"
     return "\n".join(lines) + "\n"
 

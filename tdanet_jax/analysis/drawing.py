@@ -16,6 +16,7 @@ from matplotlib.patheffects import withStroke
 
 from tdanet_jax.analysis import labels
 from tdanet_jax.io import files
+from tdanet_jax.io.escaping import in_figure
 from tdanet_jax.scenes.camera_view import CameraView
 from tdanet_jax.scenes.floor_plan import FloorPlan
 from tdanet_jax.scenes.tables import SceneTables
@@ -174,7 +175,7 @@ def _write(
 ) -> None:
     """A name whose upper left corner is at (x, y), legible on any shade."""
     axes.text(
-        x, y, text, va="top", color=color, weight="bold" if bold else "normal", zorder=9,
+        x, y, in_figure(text), va="top", color=color, weight="bold" if bold else "normal", zorder=9,
         # Letters are narrower than `labels` assumes, so that bold ones fit as well.
         fontsize=0.92 * points, path_effects=[withStroke(linewidth=2, foreground="white")],
     )  # fmt: skip

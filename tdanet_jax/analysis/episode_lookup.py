@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
 import math
 import re
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ import numpy as np
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.report import EPISODES_FILE
-from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import FileError, jsons, regular
 from tdanet_jax.labels import Labels
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import ACTION_NAMES
@@ -100,27 +99,43 @@ def read_record(run: Path | str, index: int, tables: SceneTables) -> Recorded:
     """
     path = Path(run) / EPISODES_FILE
     try:
-        lines = files.read_text(path).splitlines()
+        lines = regular.read_text(path, links=False).splitlines()
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file; a run writes it when training ends") from None
     if not 0 <= index < len(lines):
         raise ValueError(f"{path}: no episode {index}; there are 0 to {len(lines) - 1}")
+    where = f"{path}, line {index + 1}"
+    row = jsons.parse(where, lines[index])
     try:
-        return _parse(json.loads(lines[index]), tables)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}, line {index + 1}: {error}") from None
+        return _parse(where, row, tables)
+    except FileError:
+        raise
+    except ValueError as error:
+        raise FileError(where, error) from None
 
 
-def _parse(row: dict[str, Any], tables: SceneTables) -> Recorded:
-    start = Start(float(row["x"]), float(row["z"]), int(row["rotation"]), int(row["horizon"]))
-    episode = find(tables, row["scene"], row["target"], start)
+def _parse(where: str, row: Any, tables: SceneTables) -> Recorded:
+    if not isinstance(row, dict):
+        raise FileError(where, "not the record of an episode")
+    x, z, rotation, horizon, _ = (
+        jsons.number(where, row.get(name), name, 1e6)
+        for name in ("x", "z", "rotation", "horizon", "L")
+    )
+    for name in ("scene", "target"):
+        if not isinstance(row.get(name), str):
+            raise FileError(where, f"{name} is not text")
+    episode = find(
+        tables, row["scene"], row["target"], Start(x, z, round(rotation), round(horizon))
+    )
+    if not isinstance(row.get("actions"), list):
+        raise FileError(where, "actions is not a list")
     for name in row["actions"]:
         if name not in ACTION_NAMES:
             raise ValueError(f"{name!r}: no action; there are {', '.join(ACTION_NAMES)}")
     actions = np.array([ACTION_NAMES.index(name) for name in row["actions"]], int)
     place = tables.position[tables.grid.split(episode.pose[0]).position][[0, 2]]
     shortest = tables.distance[episode.pose[0], episode.target[0]] + 1
-    if not np.allclose(place, start[:2], atol=1e-3) or shortest != row["L"]:
+    if not np.allclose(place, (x, z), atol=1e-3) or shortest != row["L"]:
         raise ValueError("recorded on other scene tables")
     if not len(actions):
         raise ValueError("no actions")

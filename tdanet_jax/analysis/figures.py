@@ -20,6 +20,7 @@ from tdanet_jax.analysis import drawing
 from tdanet_jax.analysis.attention import MIN_FRAMES, ClassPairs
 from tdanet_jax.analysis.drawing import BLUE, GREEN, MARKERS, ORANGE, PALETTE, SHADES
 from tdanet_jax.evaluation.comparison import MEASURES, Curve
+from tdanet_jax.io.escaping import in_figure
 from tdanet_jax.splits import GROUPS
 
 DPI = 130
@@ -104,7 +105,7 @@ def evaluated_curves(curves: Sequence[Curve], title: str, path: Path) -> None:
 
 def _in_lines(title: str) -> str:
     """A title over two panels; the name of a split may be longer than they are wide."""
-    return textwrap.fill(re.sub(r",(?! )", ", ", title), 90)
+    return textwrap.fill(in_figure(re.sub(r",(?! )", ", ", title)), 90)
 
 
 def _draw_curve(
@@ -119,7 +120,7 @@ def _draw_curve(
     seen = group == "seen"
     axis.plot(
         x, mean, "-" if seen else "--", color=color, marker=marker, markersize=4, linewidth=1.5,
-        markerfacecolor=color if seen else "white", label=f"{curve.label}, {group}",
+        markerfacecolor=color if seen else "white", label=in_figure(f"{curve.label}, {group}"),
     )  # fmt: skip
     if sd.any():
         axis.fill_between(x, mean - sd, mean + sd, color=color, alpha=0.15, linewidth=0)
@@ -157,8 +158,10 @@ def class_pairs(pairs: ClassPairs, unseen: Collection[str], title: str, path: Pa
         if name in rows:
             corner = (column - 0.5, rows[name] - 0.5)
             axes.add_patch(Rectangle(corner, 1, 1, fill=False, edgecolor="black", lw=1.6))
-    axes.set_yticks(range(len(rows)), [name + "*" * (name in unseen) for name in rows], fontsize=9)
-    axes.set_xticks(range(len(seen)), seen, fontsize=9, rotation=90)
+    axes.set_yticks(
+        range(len(rows)), [in_figure(name) + "*" * (name in unseen) for name in rows], fontsize=9
+    )
+    axes.set_xticks(range(len(seen)), [*map(in_figure, seen)], fontsize=9, rotation=90)
     axes.set(xlabel="class in view", ylabel="target")
     axes.spines[:].set_visible(False)
     bar = figure.colorbar(ScalarMappable(Normalize(0, 100), SHADES), ax=axes, pad=0.01, aspect=30)
@@ -169,5 +172,5 @@ def class_pairs(pairs: ClassPairs, unseen: Collection[str], title: str, path: Pa
     )
     if unseen:
         note += "; * never a target in training"
-    axes.set_title(f"{title}\n{note}", fontsize=10)
+    axes.set_title(f"{in_figure(title)}\n{note}", fontsize=10)
     drawing.save(figure, path)

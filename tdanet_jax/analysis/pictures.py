@@ -18,6 +18,7 @@ from matplotlib.ticker import MultipleLocator
 from tdanet_jax.analysis import drawing
 from tdanet_jax.analysis.drawing import BLUE, DASHED, FRAME, GREEN, ORANGE, SHADES
 from tdanet_jax.io import files
+from tdanet_jax.io.escaping import in_figure
 from tdanet_jax.scenes import camera_view, floor_plan
 from tdanet_jax.scenes.floor_plan import FloorPlan
 from tdanet_jax.scenes.scene import Scene
@@ -56,7 +57,7 @@ def trajectories(traces: Sequence[Trace], plan: FloorPlan, tables: SceneTables, 
         _FIELD_OF_VIEW,
         Line2D([], [], marker="*", ms=13, **dot, label="success"),
         Line2D([], [], marker="X", ms=9, **dot, label="failure"),
-        Patch(fill=False, edgecolor="black", lw=2.2, label=traces[0].target),
+        Patch(fill=False, edgecolor="black", lw=2.2, label=in_figure(traces[0].target)),
     ]
     widths = [max(scale * (x2 - x1), 3.2)] * min(len(traces), 3)
     title = f"{traces[0].target} in {traces[0].scene}"
@@ -64,7 +65,7 @@ def trajectories(traces: Sequence[Trace], plan: FloorPlan, tables: SceneTables, 
     for axes, trace in zip(panels, traces, strict=True):
         drawing.draw_plan(axes, plan, trace.target)
         drawing.draw_path(axes, trace, plan, tables)
-        axes.set_title(f"{trace.player}\n{trace.outcome}", fontsize=9.5)
+        axes.set_title(in_figure(f"{trace.player}\n{trace.outcome}"), fontsize=9.5)
     drawing.save(figure, path)
 
 
@@ -97,7 +98,7 @@ def _draw_step(
     drawing.draw_path(left, trace, plan, tables, step)
     seen = camera_view.of_pose(tables, int(trace.pose[step]))
     drawing.draw_view(right, seen, weights, trace.target)
-    left.set_title(trace.player, fontsize=10)
+    left.set_title(in_figure(trace.player), fontsize=10)
     right.set_title(_decision(trace, step) if step == decided else trace.outcome, fontsize=10)
 
 
@@ -115,8 +116,9 @@ _FIELD_OF_VIEW = Patch(facecolor=ORANGE, alpha=0.25, label="field of view to 1.5
 
 def _view_handles(trace: Trace) -> list[Patch]:
     """The legend of a camera's view."""
-    near = Patch(fill=False, edgecolor="black", lw=2.6, label=f"{trace.target}, within 1.5 m")
-    far = Patch(fill=False, edgecolor="black", lw=2.6, ls=DASHED, label=f"{trace.target}, farther")
+    target = in_figure(trace.target)
+    near = Patch(fill=False, edgecolor="black", lw=2.6, label=f"{target}, within 1.5 m")
+    far = Patch(fill=False, edgecolor="black", lw=2.6, ls=DASHED, label=f"{target}, farther")
     if trace.attention is None:
         return [near, far, Patch(fill=False, edgecolor=FRAME, label="this agent has no attention")]
     shades = ((0.1, "attention 10 %"), (0.5, "50 %"), (1.0, "100 %"))
@@ -142,7 +144,7 @@ def _panels(
         left=(margin + 0.1) / size[0], right=1 - 0.1 / size[0], wspace=0.1 * columns / wide,
         bottom=below / size[1], top=1 - above / size[1], hspace=0.5 / high,
     )  # fmt: skip
-    figure.suptitle(title, fontsize=12, y=1 - 0.05 / size[1], va="top")
+    figure.suptitle(in_figure(title), fontsize=12, y=1 - 0.05 / size[1], va="top")
     figure.legend(handles=handles, loc="lower center", ncols=ncols, frameon=False, fontsize=8.5)
     for axes in grid.flat[count:]:
         axes.set_axis_off()

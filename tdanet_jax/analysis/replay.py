@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.resources
-import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from tdanet_jax.analysis import labels
 from tdanet_jax.analysis.trace import Trace
+from tdanet_jax.io.escaping import in_script
 from tdanet_jax.scenes import camera_view, floor_plan
 from tdanet_jax.scenes.floor_plan import FloorPlan
 from tdanet_jax.scenes.tables import SceneTables
@@ -53,15 +53,7 @@ def page(traces: Sequence[Trace], tables: SceneTables) -> str:
         ],
     }
     template = importlib.resources.files(__package__).joinpath("replay.html").read_text("utf-8")
-    return template.replace(SLOT, embed(episode))
-
-
-def embed(value: Any) -> str:
-    """JSON that is safe inside a `script` element, whatever its strings contain."""
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
-    for sign in "<>&":
-        text = text.replace(sign, f"\\u{ord(sign):04x}")
-    return text
+    return template.replace(SLOT, in_script(episode))
 
 
 def _plan(plan: FloorPlan, target: str, scale: float) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from tdanet_jax.scenes import camera_view
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.task import Task, task_in
+from tdanet_jax.training import history
 from tdanet_jax.vocabulary import Action
 
 
@@ -97,6 +98,7 @@ def load_player(
     task.check_known(run, classes.names)
     if path is not None:
         check_width(run, task.model, weights, task.words.shape)
+    history.check_fit(Path(run), weights, task.model.parameter_shapes(*task.words.shape))
     return Player(Path(run).resolve().name, task, task.model, weights, greedy)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from tdanet_jax.config import TrainConfig, describe_departures
 from tdanet_jax.evaluation import metrics, paper
 from tdanet_jax.evaluation.metrics import BUCKETS
+from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.splits import GROUPS
 
 Result = Mapping[str, Any]
@@ -217,15 +218,15 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
       results: as `saved_networks.Evaluated.results` gives them.
       runs: a short name for each; points of one run, which are not averaged, share one.
     """
-    lines = [f"# {title}", "", "SR and SPL in percent, test rooms."]
+    lines = [f"# {in_markdown(title)}", "", "SR and SPL in percent, test rooms."]
     departures = results[0].get("departures") if results else None  # all are played alike
     if departures:
-        lines += ["", f"**{describe_departures(departures)}.**"]
+        lines += ["", f"**{in_markdown(describe_departures(departures))}.**"]
     for split in dict.fromkeys(result["split"] for result in results):
         own = [result for result in results if result["split"] == split]
         names = [run for run, r in zip(runs, results, strict=True) if r["split"] == split]
         rows: list[_Row] = [
-            ((run, f"{r['updates']:,}", f"{r['episodes_trained']:,}", r["policy"]), r)
+            ((in_markdown(run), f"{r['updates']:,}", f"{r['episodes_trained']:,}", r["policy"]), r)
             for run, r in zip(names, own, strict=True)
         ]
         rows += (differing := list(_differences(own, names)))
@@ -260,7 +261,7 @@ def _differences(results: Sequence[Result], names: Sequence[str]) -> Iterator[_R
             for group in GROUPS
             if difference[group] is not None
         }
-        yield (f"{name} minus {to}", "", "", result["policy"]), groups
+        yield (in_markdown(f"{name} minus {to}"), "", "", result["policy"]), groups
 
 
 def _means(results: Sequence[Result], names: Sequence[str]) -> Iterator[_Row]:
@@ -272,7 +273,10 @@ def _means(results: Sequence[Result], names: Sequence[str]) -> Iterator[_Row]:
         together.setdefault(label, []).append(result)
     for label, seeds in together.items():
         if len(seeds) > 1:
-            yield (f"**{label}, {len(seeds)} seeds**", "", "", seeds[0]["policy"]), summary(seeds)
+            yield (
+                (f"**{in_markdown(label)}, {len(seeds)} seeds**", "", "", seeds[0]["policy"]),
+                summary(seeds),
+            )
 
 
 class Curve(NamedTuple):

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from tdanet_jax.io.escaping import in_markdown
+
 WORLDS_DIFFER = (
     "The worlds differ: the paper used AI2-THOR 1.0.1 and its own test episodes; these rooms are "
     "rebuilt from the metadata of a later version."
@@ -15,7 +17,7 @@ WORLDS_DIFFER = (
 
 def worlds(data: str | None) -> str:
     """The note on the paper's rows; `data` is a file of rooms other than the bundled ones."""
-    return WORLDS_DIFFER if data is None else f"These rooms are those of {data}."
+    return WORLDS_DIFFER if data is None else f"These rooms are those of {in_markdown(data)}."
 
 
 class Rate(NamedTuple):

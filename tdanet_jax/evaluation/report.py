@@ -19,6 +19,7 @@ from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.metrics import BUCKETS, grouped, shown, summarise
 from tdanet_jax.evaluation.rollout import Records
 from tdanet_jax.io import files
+from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.registry import SENSORS
 from tdanet_jax.scenes.tables import SceneTables
@@ -233,13 +234,13 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
     departures = out.get("departures")
     published = {} if departures else paper.rates(out["split"])
     lines = [
-        f"# {agent}, split {out['split']}, seed {out['seed']}",
+        f"# {in_markdown(agent)}, split {out['split']}, seed {out['seed']}",
         "",
         f"{out['episodes_trained']:,} training episodes, {out['steps']:,} environment steps; "
         f"{out['policy']} actions, evaluation seed {out['evaluation_seed']}; scene tables "
         f"{out['data_version']}, code {out['commit']}.",
-        *(["", f"**{describe_departures(departures)}.**", ""] if departures else []),
-        *(f"{name.capitalize()}: {out[name]}." for name in ("data", "image") if out[name]),
+        *(["", f"**{in_markdown(describe_departures(departures))}.**", ""] if departures else []),
+        *(f"{n.capitalize()}: {in_markdown(out[n])}." for n in ("data", "image") if out[n]),
         "",
         "SR and SPL in percent, with 95 % bootstrap intervals over (room, target) pairs.",
         "",
@@ -248,7 +249,7 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
     for group in GROUPS:
         if out[group] is None:
             continue
-        lines.append(_row((group, f"**{agent} (ours)**"), out[group]))
+        lines.append(_row((group, f"**{in_markdown(agent)} (ours)**"), out[group]))
         for name, theirs in published.items():
             if group in theirs:
                 lines.append(_row((group, f"{name} (paper)"), theirs[group]))
@@ -269,7 +270,7 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
     for title, key in (("Room", "by_room"), ("Target", "by_target")):
         lines += ["", f"## By {title.lower()}", "", *_header(title, "Group")]
         for name, parts in out[key].items():
-            lines += [_row((name, group), buckets) for group, buckets in parts.items()]
+            lines += [_row((in_markdown(name), group), buckets) for group, buckets in parts.items()]
     return "\n".join(lines) + "\n"
 
 

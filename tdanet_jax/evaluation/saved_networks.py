@@ -7,7 +7,7 @@ compilation.
 from __future__ import annotations
 
 import dataclasses
-import shutil
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ from tdanet_jax import words
 from tdanet_jax.config import CONFIG_FILE, OWN_TASK, WORD_VECTORS_FILE, EvalConfig, TrainConfig
 from tdanet_jax.evaluation import comparison, policies, report, rollout, selection
 from tdanet_jax.evaluation.report import Played
-from tdanet_jax.io import assets
+from tdanet_jax.io import assets, files
+from tdanet_jax.io.untrusted import regular
 from tdanet_jax.models import classes
 from tdanet_jax.models.factory import check_width
 from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
@@ -138,8 +139,10 @@ def share(run: Path | str, out: Path | str, word_vectors: Path | str | None = No
     if vectors is not None:
         vectors.save_copy(out / WORD_VECTORS_FILE, vocabulary.names)
     for name in (report.RESULTS_PAGE, report.EPISODES_FILE, report.RESULTS_FILE):
-        if (run / name).is_file():
-            shutil.copyfile(run / name, out / name)
+        if os.path.lexists(run / name):
+            content = regular.read_bytes(run / name, links=False)
+            with files.replacing(out / name) as fresh:
+                fresh.write_bytes(content)
 
 
 def evaluate(
@@ -162,10 +165,13 @@ def evaluate(
         task = load_task(members[0].located)
         params, lists = selection.select(task, members[0].test)
         policy = policies.network(task.model, task.words, greedy)
+        expected = task.model.parameter_shapes(*task.words.shape)
         together = 1 if jax.default_backend() == "cpu" else TOGETHER
         for start in range(0, len(members), together):
             part = members[start : start + together]
             snapshots = [_checked(network, task) for network in part]
+            for network, snapshot in zip(part, snapshots, strict=True):
+                history.check_fit(network.point or network.run, snapshot.weights, expected)
             weights = jax.tree.map(
                 lambda *leaves: jnp.stack(leaves), *(s.weights for s in snapshots)
             )

@@ -15,30 +15,36 @@ from filelock import FileLock, Timeout
 
 #: A process locks this file while it works in the folder.
 LOCK_FILE = ".lock"
-#: Prefix of files that are being written; a process that is killed may leave one.
+#: Prefix of what is being written; a process that is killed may leave it.
 PARTIAL = ".partial-"
-
-
-def partial_path(path: Path) -> Path:
-    """The temporary file next to `path` that this process writes first."""
-    return path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path next to `path`; renamed to `path` at the end, removed on an error.
+    """Where to write a file or a folder that becomes `path` at the end; removed on an error.
+
+    It lies in a new folder next to `path`, with a random name and for this user alone, so that
+    nobody can guess it and put a link there.
 
     Raises:
       OSError: it cannot be written; the error names `path`.
     """
-    temporary = partial_path(path)
     try:
-        yield temporary
-        os.replace(temporary, path)
+        with private_folder(path.parent) as folder:
+            yield folder / path.name
+            os.replace(folder / path.name, path)
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+
+
+@contextlib.contextmanager
+def private_folder(parent: Path) -> Iterator[Path]:
+    """A new folder in `parent` for what is being written; removed at the end with what is in it."""
+    folder = Path(tempfile.mkdtemp(prefix=f"{PARTIAL}{os.getpid()}-", dir=parent))
+    try:
+        yield folder
     finally:
-        temporary.unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -71,18 +77,20 @@ def remove_partial(folder: Path) -> list[Path]:
 
 def remove_abandoned(path: Path) -> list[Path]:
     """Removes unfinished versions of `path` whose process no longer runs."""
-    name = re.compile(rf"{re.escape(PARTIAL)}(\d{{1,9}})-{re.escape(path.name)}")
+    name = re.compile(rf"{re.escape(PARTIAL)}(\d{{1,9}})-[^-]*")
     found = []
-    for candidate in sorted(path.parent.glob(f"{PARTIAL}*")):
-        match = name.fullmatch(candidate.name)
-        if match is not None and not _is_running(int(match[1])):
-            _remove(candidate)
-            found.append(candidate)
+    for folder in sorted(path.parent.glob(f"{PARTIAL}*")):
+        match = name.fullmatch(folder.name)
+        if match is None or folder.is_symlink() or _is_running(int(match[1])):
+            continue
+        if os.path.lexists(folder / path.name):
+            _remove(folder)
+            found.append(folder)
     return found
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         path.unlink()
@@ -142,6 +150,8 @@ def locked(folder: Path, wait: bool = False) -> Iterator[None]:
     """
     created = [place for place in (folder, *folder.parents) if not place.exists()]
     folder.mkdir(parents=True, exist_ok=True)
+    if (folder / LOCK_FILE).is_symlink():
+        raise OSError(errno.ELOOP, "a link, which is not followed here", str(folder / LOCK_FILE))
     lock = FileLock(folder / LOCK_FILE)
     try:
         lock.acquire(blocking=wait)

@@ -162,6 +162,11 @@ class ActorCritic(nn.Module):
 
         return nn.init(everything, self)(key)["params"]
 
+    def parameter_shapes(self, classes: int, width: int) -> Any:
+        """Shapes of the parameters for word vectors [classes, width]; nothing is computed."""
+        words = jax.ShapeDtypeStruct((classes, width), jnp.float32)
+        return jax.eval_shape(self.initialise, jax.random.key(0), words)
+
 
 def prepare(model: ActorCritic, weights: Any, words: jax.Array) -> Any:
     """The table of classes of these weights, from word vectors [C, D]."""

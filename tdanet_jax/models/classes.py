@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import FileError, jsons
+from tdanet_jax.io.untrusted.jsons import number
 
 CLASSES_FILE = "classes.json"
+#: Classes in a file, at most; the tables of rooms have room for 127.
+MOST_NAMES = 1000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,13 +93,31 @@ def load_vocabulary(run: Path | str) -> ClassVocabulary:
     """
     run = Path(run)
     path = run / CLASSES_FILE
-    try:
-        values = json.loads(files.read_text(path))
-        edges = tuple((int(i), int(j), float(w)) for i, j, w in values.get("edges", ()))
-        return ClassVocabulary(tuple(values["names"]), tuple(values["known"]), edges)
-    except FileNotFoundError:
+    if not os.path.lexists(path):
         return ClassVocabulary()
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}") from None
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not a vocabulary of this version: {error}") from None
+    values = jsons.load(path, links=False)
+    if not isinstance(values, dict):
+        raise FileError(path, "not a vocabulary")
+    names: Any = values.get("names")
+    known: Any = values.get("known")
+    edges: Any = values.get("edges", [])  # the first versions wrote none
+    if not isinstance(names, list) or len(names) > MOST_NAMES:
+        raise FileError(path, f"names: not a list of up to {MOST_NAMES} classes")
+    if not all(isinstance(name, str) and name.isprintable() for name in names):
+        raise FileError(path, "names: a class that is not a line of text")
+    if not _are_among(known, range(len(names))) or len(set(known)) < len(known):
+        raise FileError(path, "known: not a list of different indices of names")
+    if not isinstance(edges, list):
+        raise FileError(path, "edges: not a list")
+    for edge in edges:
+        if not isinstance(edge, list) or len(edge) != 3 or not _are_among(edge[:2], known):
+            raise FileError(path, "edges: not two indices of known classes and a weight each")
+        if number(path, edge[2], "edges: a weight", 1e9) < 0:
+            raise FileError(path, "edges: a weight below 0")
+    triples = tuple((i, j, float(weight)) for i, j, weight in edges)
+    return ClassVocabulary(tuple(names), tuple(known), triples)
+
+
+def _are_among(values: Any, allowed: Collection[int]) -> bool:
+    """Whether `values` is a list of whole numbers that are all `allowed`."""
+    return isinstance(values, list) and all(type(v) is int and v in allowed for v in values)

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from tdanet_jax.io import archive, files
-from tdanet_jax.io.untrusted import FileError, npz
+from tdanet_jax.io.untrusted import FileError, jsons, npz
 from tdanet_jax.scenes import cache, metadata, tabulation
+from tdanet_jax.scenes.metadata import FARTHEST
 from tdanet_jax.scenes.room_names import Kinds, check_name
 from tdanet_jax.scenes.scene import MOST_CLASSES, MOST_ROOM_TYPES, SceneError
 from tdanet_jax.scenes.tables import FIELDS, SceneTables
@@ -96,10 +97,8 @@ def load_rooms(path: str | Path | None, progress: Progress | None = None) -> Roo
     try:
         tables = SceneTables.from_arrays(arrays)
         if problem := _find_problem(tables):
-            raise FileError(path, f"not a file of rooms ({problem})")
+            raise ValueError(problem)
         return Rooms(tables.with_known_targets(), _read_extras(arrays), path)
-    except FileError:
-        raise
     except Exception as error:  # a missing array, a field of another type, broken JSON
         raise FileError(path, f"not a file of rooms ({error})") from None
 
@@ -157,8 +156,18 @@ def _find_problem(tables: SceneTables) -> str | None:
     for names in lists:
         if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
             return "names that are not text"
-    for name in (*tables.scenes, *tables.room_types):
-        check_name(name)
+        if not all(name.isprintable() for name in names):
+            return "names with control characters"
+    for names in lists[:3]:
+        if len(set(names)) < len(names):
+            return "a room, class or target that is listed twice"
+    for name in (*tables.scenes, *tables.targets, *tables.room_types):
+        check_name(name)  # they become names of files
+    angle, height = tables.field_of_view, tables.camera_height
+    if not all(type(value) in (int, float) and 0 < value < 180 for value in (angle, height)):
+        return "field_of_view or camera_height is not a number, or out of range"
+    if not all(type(v) is int and 0 < v <= 10_000 for v in (tables.image, tables.subpixel)):
+        return "image or subpixel is not a whole number, or out of range"
     if tables.room_types[: len(ROOM_TYPES)] != ROOM_TYPES or sizes["T"] > MOST_ROOM_TYPES:
         return f"other room types than iTHOR's come first, or there are over {MOST_ROOM_TYPES}"
     if len(set(tables.room_types)) != sizes["T"]:
@@ -175,8 +184,12 @@ def _find_problem(tables: SceneTables) -> str | None:
     starts = tables.row_start
     if starts[0] != 0 or starts[-1] != sizes["N"] or (np.diff(starts) < 0).any():
         return "row_start does not divide the rows"
-    if (np.diff(tables.position_scene) < 0).any() or not np.isfinite(tables.position).all():
-        return "positions are not finite or not in the order of the rooms"
+    if (np.diff(tables.position_scene) < 0).any() or (np.diff(tables.object_scene) < 0).any():
+        return "positions or objects are not in the order of the rooms"
+    if not (np.abs(tables.position) <= FARTHEST).all() or (np.abs(tables.object_box) > 2e3).any():
+        return "a position or an object that is not finite or too far away"  # a box may be unknown
+    if (tables.distance < -1).any():
+        return "distance below -1"
     if len(np.unique(tables.position_scene)) != sizes["R"]:
         return "a room without positions"
     return None
@@ -185,26 +198,41 @@ def _find_problem(tables: SceneTables) -> str | None:
 def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
     if "extras/notes" not in arrays:
         return Extras()
-    notes = json.loads(arrays["extras/notes"].tobytes())
+    notes = jsons.parse("extras/notes", arrays["extras/notes"].tobytes().decode())
     names, adjacency = tuple(notes["graph_classes"]), arrays["extras/adjacency"]
     if adjacency.shape != (len(names), len(names)) or adjacency.dtype != np.float32:
         raise ValueError("the class graph does not match its names")
+    if not (np.isfinite(adjacency) & (adjacency >= 0)).all():
+        raise ValueError("the class graph has a weight that is not finite or below 0")
+    if not all(isinstance(name, str) and name.isprintable() for name in names):
+        raise ValueError("the class graph has names that are not text")
     parts = notes.get("parts", {})  # older files have none
     if not set(parts.values()) <= set(PARTS):
         raise ValueError(f"a room whose part is neither of {', '.join(PARTS)}")
     return Extras(
         parents={
-            str(room): {
-                str(target): {str(name): float(reward) for name, reward in parents.items()}
+            ROOM_TYPES[ROOM_TYPES.index(room)]: {
+                target: {
+                    name: jsons.number("parents", reward, name, 100)
+                    for name, reward in parents.items()
+                }
                 for target, parents in targets.items()
             }
             for room, targets in notes["parents"].items()
         },
-        episodes=[PublishedEpisode(*values) for values in notes["episodes"]],
+        episodes=[_read_episode(values) for values in notes["episodes"]],
         graph_classes=names,
         adjacency=adjacency,
         parts=parts,
     )
+
+
+def _read_episode(values: Sequence[Any]) -> PublishedEpisode:
+    part, scene, x, z, rotation, horizon, target = values
+    if not all(isinstance(text, str) for text in (part, scene, target)):
+        raise ValueError("an episode whose part, scene or target is not text")
+    x, z, *turns = (jsons.number("episodes", n, "a pose", 1000) for n in (x, z, rotation, horizon))
+    return PublishedEpisode(part, scene, x, z, round(turns[0]), round(turns[1]), target)
 
 
 def assign_rooms(split: Split, rooms: Rooms, validation: bool = False) -> Split:

@@ -27,8 +27,6 @@ as that class; any other is a class of its own.
 from __future__ import annotations
 
 import dataclasses
-import json
-import math
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -37,12 +35,13 @@ from typing import Any
 
 import numpy as np
 
-from tdanet_jax.io import files
+from tdanet_jax.io.escaping import in_line
+from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.labels import ai2thor_class
 from tdanet_jax.poses import ITHOR, TURNS, PoseGrid
 from tdanet_jax.scenes import house
 from tdanet_jax.scenes.room_names import Kinds, RoomKind, check_kind, check_name, known_type
-from tdanet_jax.scenes.scene import Scene, SceneError, SceneObject
+from tdanet_jax.scenes.scene import MOST_OBJECTS, MOST_POINTS, Scene, SceneError, SceneObject
 from tdanet_jax.vocabulary import IGNORED
 
 ALIGNED = 0.02  # metres by which a point may miss the grid
@@ -67,6 +66,8 @@ def parse_scene(
     objects.sort(key=lambda item: (item.object_class, item.object_id))
     if not objects:
         raise SceneError(f"{name}: no objects")
+    if len(objects) > MOST_OBJECTS:
+        raise SceneError(f"{name}: {len(objects)} objects, more than {MOST_OBJECTS}")
     identity, times = Counter(item.object_id for item in objects).most_common(1)[0]
     if times > 1:
         raise SceneError(f"{name}: {identity}: id occurs {times} times")
@@ -84,6 +85,8 @@ def check_points(name: str, points: np.ndarray, size: float = ITHOR.grid_size) -
     """
     if len(points) == 0:
         raise SceneError(f"{name}: no reachable position")
+    if len(points) > MOST_POINTS:
+        raise SceneError(f"{name}: {len(points)} reachable positions, more than {MOST_POINTS}")
     if not np.isfinite(points).all() or np.abs(points).max() > FARTHEST:
         raise SceneError(f"{name}: a reachable position is not finite or over {FARTHEST:.0f} m")
     steps = (points - points[0])[:, [0, 2]] / size
@@ -136,6 +139,8 @@ def _text(scene: str, record: Mapping[str, Any], key: str) -> str:
     value = record.get(key) if isinstance(record, Mapping) else None
     if not isinstance(value, str) or not value:
         raise SceneError(f"{scene}: an object without {key}")
+    if not value.isprintable():
+        raise SceneError(f"{scene}: {key} {value[:40]}: has a control character")
     return value
 
 
@@ -147,12 +152,7 @@ def _vector(scene: str, name: str, record: Mapping[str, Any], key: str) -> np.nd
 
 
 def _is_number(value: Any) -> bool:
-    return (
-        isinstance(value, int | float)
-        and not isinstance(value, bool)
-        and math.isfinite(value)
-        and abs(value) <= FARTHEST
-    )
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= FARTHEST
 
 
 def _corners(scene: str, name: str, oriented: Any) -> np.ndarray:
@@ -175,19 +175,25 @@ def read_scenes(path: Path | str, kinds: Kinds | None = None) -> list[Scene]:
       kinds: room types and parts of the rooms for which the file does not say them.
 
     Raises:
-      SceneError: it is not such a file, or a scene breaks a rule.
+      SceneError: it is not such a file, or a scene breaks a rule; the message begins with the path.
     """
     path = Path(path)
     try:
-        content = json.loads(files.read_text(path))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise SceneError(f"{path}: not JSON ({error})") from None
-    except OSError as error:
-        raise SceneError(f"{path}: {error.strerror}") from None
+        return _read_scenes(path, kinds or Kinds())
+    except SceneError as error:
+        if str(error).startswith(in_line(path)):
+            raise
+        raise SceneError(f"{path}: {error}") from None
+
+
+def _read_scenes(path: Path, kinds: Kinds) -> list[Scene]:
+    try:
+        content = jsons.load(path, nan=True)  # in fields that are not read
+    except FileError as error:
+        raise SceneError(str(error)) from None
     documents = content if isinstance(content, list) else [content]
     if not documents:
         raise SceneError(f"{path}: no scenes")
-    kinds = kinds or Kinds()
     names = [document.get("name") for document in documents if isinstance(document, Mapping)]
     if unknown := [name for name in kinds.table if name not in names]:
         raise SceneError(f"{path}: no room is called {unknown[0]}, which --rooms lists")

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from tdanet_jax.io import files
-from tdanet_jax.io.untrusted import FileError
+from tdanet_jax.io.escaping import in_name
+from tdanet_jax.io.untrusted import FileError, regular
 from tdanet_jax.scenes.scene import SceneError
 from tdanet_jax.splits import ITHOR_ROOMS, PARTS, SCENE_NUMBERS, TRAIN_SCENES_PER_TYPE
 from tdanet_jax.vocabulary import ROOM_TYPES, class_words
@@ -18,7 +18,6 @@ from tdanet_jax.vocabulary import ROOM_TYPES, class_words
 #: Bytes of UTF-8: names of rooms become names of files.
 LONGEST_NAME = 200
 COLUMNS = ("name", "room_type", "part")
-LARGEST_TABLE = 16 << 20  # bytes
 
 _ITHOR = re.compile(r"FloorPlan([1-9][0-9]{0,2})(?![0-9])")
 
@@ -40,7 +39,7 @@ def check_name(name: str, what: str = "room name") -> None:
       SceneError: the name is empty, too long, begins or ends with a space, is "." or "..", or has a
         path separator (/, \\ or :) or a character that cannot be printed.
     """
-    shown = "".join(c if c.isprintable() else "?" for c in name[:40])
+    shown = in_name(name[:40])
     if not name.isprintable():
         raise SceneError(f"{what} {shown!r}: has a control character")
     if any(separator in name for separator in "/\\:") or name in (".", ".."):
@@ -131,13 +130,11 @@ def read_table(path: Path | str) -> dict[str, RoomKind]:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > LARGEST_TABLE:
-            raise FileError(path, f"larger than {LARGEST_TABLE >> 20} MiB")
-        rows = csv.reader(files.read_text(path).splitlines(), strict=True)
+        rows = csv.reader(regular.read_text(path).splitlines(), strict=True)
         lines = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
     except OSError as error:
         raise FileError(path, error.strerror) from None
-    except (UnicodeDecodeError, csv.Error) as error:
+    except csv.Error as error:
         raise FileError(path, f"not a CSV table ({error})") from None
     header = lines[0][1] if lines else []
     if len(set(header)) != len(header) or not {"name"} <= set(header) <= {*COLUMNS}:

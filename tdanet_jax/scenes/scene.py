@@ -6,10 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tdanet_jax.io.escaping import in_line
 from tdanet_jax.poses import ITHOR, PoseGrid
 
 MOST_CLASSES = 127  # in all rooms together: the raster stores a class as int8
 MOST_ROOM_TYPES = 127  # in all rooms together: the tables store a type as int8
+MOST_ROOMS = 32_767  # the tables store a room as int16
+MOST_POINTS = MOST_OBJECTS = 20_000  # of a room
+LONGEST = 400  # characters of an error's message
 SUBPIXEL = 16  # boxes are stored in sixteenths of a pixel
 CAMERA_ABOVE_AGENT = 0.675  # metres from the agent's y to its camera, AI2-THOR's default agent
 
@@ -18,8 +22,7 @@ class SceneError(ValueError):
     """A scene breaks a rule; the message is one line that names scene, object and rule."""
 
     def __init__(self, message: str) -> None:
-        # Names come from files and may contain line breaks.
-        super().__init__(" ".join(message.split()))
+        super().__init__(in_line(message, LONGEST))  # names come from files
 
 
 @dataclass(frozen=True, eq=False)

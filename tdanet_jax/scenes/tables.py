@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from tdanet_jax.io import archive
-from tdanet_jax.io.untrusted import npz
+from tdanet_jax.io.untrusted import jsons, npz
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene, SceneError, SceneObject
 from tdanet_jax.vocabulary import FIELD_OF_VIEW, IMAGE_SIZE, ROOM_TYPES
@@ -245,7 +245,7 @@ class SceneTables:
         own: dict[str, Any] = {name: a for name, a in arrays.items() if "/" not in name}
         if "room_type" in own:
             own["position_room_type"] = own.pop("room_type")[own["position_scene"]]
-        rest = json.loads(own.pop("rest").tobytes())
+        rest = jsons.parse("rest", own.pop("rest").tobytes().decode())
         fields: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in rest.items()
         }

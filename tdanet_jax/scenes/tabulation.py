@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 import numpy as np
 
 from tdanet_jax.scenes.room_names import type_names
-from tdanet_jax.scenes.scene import MOST_CLASSES, MOST_ROOM_TYPES, SUBPIXEL, Scene, SceneError
+from tdanet_jax.scenes.scene import (
+    MOST_CLASSES,
+    MOST_ROOM_TYPES,
+    MOST_ROOMS,
+    SUBPIXEL,
+    Scene,
+    SceneError,
+)
 from tdanet_jax.scenes.tables import FIELDS, SceneTables, row_offsets
 from tdanet_jax.scenes.visibility.build import Detections, detect
 from tdanet_jax.scenes.visibility.geometry import action_distances, next_positions, transitions
@@ -23,8 +31,11 @@ MOST_WORKERS = 8
 
 CELLS = 7  # along each side of the raster
 
-#: Called with the number of rooms that are done, and of all rooms.
-Progress = Callable[[int, int], None]
+BOXES = 1 << 18  # that are painted at once
+SECONDS_BETWEEN_REPORTS = 1.0  # while a room is computed
+
+#: Called with the number of rooms that are done, parts of rooms included, and of all rooms.
+Progress = Callable[[float, int], None]
 
 
 def build(
@@ -51,21 +62,41 @@ def build(
     if len(type_names(name for scene in scenes for name in scene.point_types)) > MOST_ROOM_TYPES:
         raise SceneError(f"more than {MOST_ROOM_TYPES} room types")
 
-    def build_room(scene: Scene) -> SceneTables:
+    if len(scenes) > MOST_ROOMS:
+        raise SceneError(f"{len(scenes)} rooms, more than {MOST_ROOMS}")
+    shares = np.zeros(len(scenes))  # of each room, done
+
+    def build_room(number: int) -> SceneTables:
+        scene = scenes[number]
         for item in scene.objects:
             if item.object_class not in names:
                 raise SceneError(
                     f"{scene.name}: {item.object_id}: class {item.object_class} is not known"
                 )
         ahead = next_positions(scene.points, scene.grid)
-        return tabulate(scene, ahead, detect(scene, rules), targets)
+
+        def note(share: float) -> None:
+            shares[number] = share
+
+        room = tabulate(scene, ahead, detect(scene, rules, report=note), targets)
+        note(1.0)
+        return room
+
+    def show() -> None:
+        if progress is not None:
+            progress(float(shares.sum()), len(scenes))
 
     rooms = []
     with ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, MOST_WORKERS)) as pool:
-        for room in pool.map(build_room, scenes):
-            rooms.append(room)
-            if progress is not None:
-                progress(len(rooms), len(scenes))
+        futures = [pool.submit(build_room, number) for number in range(len(scenes))]
+        try:
+            for future in futures:
+                while wait([future], SECONDS_BETWEEN_REPORTS).not_done:
+                    show()
+                rooms.append(future.result())
+                show()
+        finally:
+            pool.shutdown(cancel_futures=True)
     return join(rooms, names)
 
 
@@ -127,7 +158,22 @@ def paint(
       states: number of states.
       size: width and height of the image in the units of `box`.
     """
-    box = box.astype(np.int32)
+    raster = np.full(states * CELLS * CELLS, -1, np.int8)
+    by_state = np.argsort(state, kind="stable")
+    starts = np.flatnonzero(np.diff(state[by_state], prepend=-1))
+    # Batches end where a state ends: within a state, the order of painting matters.
+    bounds = [0, *starts[np.unique(np.searchsorted(starts, range(BOXES, len(state), BOXES)))
+                         .clip(max=len(starts) - 1)].tolist(), len(state)]  # fmt: skip
+    for first, stop in itertools.pairwise(sorted(set(bounds))):
+        rows = by_state[first:stop]
+        _paint(raster, state[rows], box[rows].astype(np.int32), label[rows], size)
+    return raster.reshape(states, CELLS, CELLS)
+
+
+def _paint(
+    raster: np.ndarray, state: np.ndarray, box: np.ndarray, label: np.ndarray, size: int
+) -> None:
+    """Paints all boxes of some states into a raster [states * 49]."""
     # Cell c is covered if its middle, (c + 1/2) * size / 7, lies in [low, high).
     first = -((size - box[:, :2] * (2 * CELLS)) // (2 * size))
     stop = -((size - box[:, 2:] * (2 * CELLS)) // (2 * size))
@@ -139,9 +185,7 @@ def paint(
     row = np.repeat(order, count)
     step = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
     across, down = step % width[row] + first[row, 0], step // width[row] + first[row, 1]
-    raster = np.full(states * CELLS * CELLS, -1, np.int8)
     raster[(state[row] * CELLS + down) * CELLS + across] = label[row].astype(np.int8)
-    return raster.reshape(states, CELLS, CELLS)
 
 
 def join(rooms: Sequence[SceneTables], classes: Sequence[str]) -> SceneTables:

@@ -25,7 +25,7 @@ from tdanet_jax.models import actor_critic, parameter_count
 from tdanet_jax.models.actor_critic import SENSOR_UNITS, ActorCritic
 from tdanet_jax.sensors import suite
 from tdanet_jax.task import Task, load_task
-from tdanet_jax.training import devices, learner
+from tdanet_jax.training import devices, history, learner
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
 Row = dict[str, Any]
@@ -239,6 +239,7 @@ def evaluation_row(run: Path | None, task: Task, networks: int, repeats: int) ->
     else:
         network = saved_networks.find(run)[0]
         task, weights = load_task(network.located), network.load().weights
+        history.check_fit(run, weights, task.model.parameter_shapes(*task.words.shape))
     stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * networks), weights)
     policy = policies.network(task.model, task.words)
     lists = episodes.load(task.tables, task.split, task.extras)

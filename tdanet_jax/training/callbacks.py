@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class Callbacks:
     """What a caller hears while runs train. Override the methods that you need."""
 
-    def on_rooms(self, done: int, total: int) -> None:
+    def on_rooms(self, done: float, total: int) -> None:
         """So many of the bundled rooms have been rebuilt; only on a machine's first start."""
 
     def on_note(self, text: str) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import logging
+import os
 import shutil
 import sys
 import threading
@@ -22,9 +23,10 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
-from flax import traverse_util
 
 from tdanet_jax.io import assets, files
+from tdanet_jax.io.untrusted import FileError, jsons, orbax, regular
+from tdanet_jax.io.untrusted.budgets import unpacking_excess
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
 from tdanet_jax.training.renames import renamed
@@ -63,8 +65,7 @@ def newest(run: Path | str) -> Snapshot:
 
 def is_shared(run: Path | str) -> bool:
     """Whether a folder holds a shared agent: a network, and nothing to continue training from."""
-    run = Path(run)
-    return (run / history.NETWORK).exists()
+    return os.path.lexists(Path(run) / history.NETWORK)
 
 
 class Checkpoints:
@@ -93,13 +94,12 @@ class Checkpoints:
         """
         updates = int(state.updates)
         path = self.folder / str(updates)
-        fresh = self.folder / f"{files.PARTIAL}{updates}"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            shutil.rmtree(fresh, ignore_errors=True)
             content = jax.device_get(_plain(state))
             _check_space(self.folder, content)
-            with _quiet_threads():
+            with files.private_folder(self.folder) as partial, _quiet_threads():
+                fresh = partial / path.name
                 self._orbax.save(
                     fresh,
                     args=ocp.args.Composite(
@@ -107,10 +107,10 @@ class Checkpoints:
                         meta=ocp.args.JsonSave({**meta, "format": FORMAT}),
                     ),
                 )
-            sums = "".join(f"{sha}  {name}\n" for name, sha in _checksums(fresh).items())
-            (fresh / CHECKSUMS).write_text(sums)
-            shutil.rmtree(path, ignore_errors=True)  # only a damaged one can be there
-            fresh.rename(path)
+                sums = "".join(f"{sha}  {name}\n" for name, sha in _checksums(fresh).items())
+                (fresh / CHECKSUMS).write_text(sums)
+                shutil.rmtree(path, ignore_errors=True)  # only a damaged one can be there
+                fresh.rename(path)
         except Exception as error:  # Orbax and TensorStore raise many kinds, for a full disk too
             with contextlib.suppress(OSError):  # its threads may still write into it
                 files.remove_partial(self.folder)
@@ -147,26 +147,22 @@ class Checkpoints:
         Raises:
           ValueError: there is no checkpoint, or none can be read.
         """
-        state, meta = self._read(None)
-        return Snapshot(
-            weights=state["params"],
-            updates=int(state["updates"]),
-            episodes=int(state["episodes"]),
-            seconds=float(meta["seconds"]),
-            point=0,
-            data_version=meta["data_version"],
-        )
+        return self._read(None)
 
     def _steps(self) -> list[int]:
         """The complete checkpoints, newest first."""
+        regular.check_folder(self.folder)
         names = (path.name for path in self.folder.glob("*") if path.is_dir())
-        return sorted((int(name) for name in names if name.isdecimal()), reverse=True)
+        found = (int(name) for name in names if name.isdecimal() and str(int(name)) == name)
+        return sorted(found, reverse=True)
 
-    def _read(self, blank: Any) -> tuple[Any, dict[str, Any]]:
+    def _read(self, blank: Any) -> Any:
         faults: list[Exception] = []
         for step in self._steps():
+            path = self.folder / str(step)
             try:
-                found = self._read_one(self.folder / str(step), blank)
+                read = self._read_one(path, blank)
+                found = _snapshot(path, *read) if blank is None else read
             except NewerFormat:
                 raise  # it is sound: no older one may replace it
             except (ValueError, OSError) as error:
@@ -178,30 +174,61 @@ class Checkpoints:
         raise faults[0] if faults else ValueError(f"{self.folder}: no checkpoint")
 
     def _read_one(self, path: Path, blank: Any) -> tuple[Any, dict[str, Any]]:
+        size = regular.check_tree(path)
         _verify(path)
         try:
-            meta = self._orbax.restore(path, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
-            written = meta["meta"]["format"]
+            meta = jsons.load(path / "meta" / "metadata", links=False)
+            written = meta["format"]
             if written <= FORMAT:
-                read = self._orbax.restore(
-                    path, args=ocp.args.Composite(state=ocp.args.StandardRestore())
-                )
-                leaves = jax.tree_util.tree_leaves_with_path(read["state"])
-                found = renamed({_name(place): leaf for place, leaf in leaves}, written)
-                state = _nested(found) if blank is None else _fitted(found, blank)
-        except Exception as error:  # Orbax raises many kinds for a damaged folder
+                described = renamed(orbax.describe(path / "state"), written)
+                if blank is None:
+                    described = {n: one for n, one in described.items() if _is_of_network(n)}
+                    _check_budgets(described, size)
+                else:
+                    _fitted(described, blank)  # its shapes, before anything is read
+                found = {name: one.read() for name, one in described.items()}
+                state = history.nested(path, found) if blank is None else _fitted(found, blank)
+        except Exception as error:  # a damaged folder has many kinds of faults
             raise ValueError(f"{path}: unreadable checkpoint ({_reason(error)})") from error
         if written > FORMAT:
             raise NewerFormat(
                 f"{path}: checkpoint of format {written}, this version reads up to {FORMAT}: "
                 "a newer tdanet_jax wrote it"
             )
-        return state, dict(meta["meta"])
+        return state, meta
 
 
-def _nested(found: Mapping[str, Any]) -> Any:
-    """Nested dictionaries from leaves by name."""
-    return traverse_util.unflatten_dict(found, sep="/")
+def _is_of_network(name: str) -> bool:
+    """Whether an array of a state is needed for the network alone."""
+    return name.startswith("params/") or name in ("updates", "episodes")
+
+
+def _snapshot(path: Path, state: Any, meta: Mapping[str, Any]) -> Snapshot:
+    """The network and the progress in a checkpoint."""
+    counts = {name: state.get(name) for name in ("updates", "episodes")}
+    if any(getattr(count, "shape", None) != () for count in counts.values()):
+        raise FileError(path, "has no updates or episodes")
+    weights = state.get("params")
+    if not isinstance(weights, dict):
+        raise FileError(path, "has no params")
+    return history.snapshot(
+        path,
+        weights,
+        point=0,
+        **{name: count.item() for name, count in counts.items()},
+        **{name: meta.get(name) for name in ("seconds", "data_version")},
+    )
+
+
+def _check_budgets(described: Mapping[str, orbax.Stored], size: int) -> None:
+    """Raises ValueError if arrays are too many or too large to be read.
+
+    Args:
+      size: bytes of the checkpoint's files.
+    """
+    unpacked = sum(one.size for one in described.values())
+    if reason := unpacking_excess(len(described), unpacked, size):
+        raise ValueError(reason)
 
 
 def _fitted(found: Mapping[str, Any], blank: Any) -> Any:
@@ -220,9 +247,7 @@ def _fitted(found: Mapping[str, Any], blank: Any) -> Any:
         one, other = (f"{x.dtype}{x.shape}" for x in (found[name], leaf))
         if one != other:
             raise ValueError(f"{name} is {one}, not {other}")
-    return jax.tree.unflatten(
-        jax.tree.structure(blank), [np.asarray(found[name]) for name in wanted]
-    )
+    return jax.tree.unflatten(jax.tree.structure(blank), [found[name] for name in wanted])
 
 
 def _name(path: tuple[Any, ...]) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,15 @@ import numpy as np
 from flax import traverse_util
 
 from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import FileError, jsons, npz, regular
 from tdanet_jax.training.renames import renamed
 
 FOLDER = "history"
 SUFFIX = ".npz"
 #: The network of a shared agent's folder (`saved_networks.share`).
 NETWORK = "network.npz"
+#: Parts of a parameter's name, at most: encoder/linear2/kernel has three.
+DEEPEST = 20
 #: Version of the files' layout; `read` refuses a newer one, and renames in an older one.
 FORMAT = 2
 
@@ -87,53 +90,98 @@ def read(path: Path | str) -> Snapshot:
     """One point.
 
     Raises:
-      ValueError: the file is missing, damaged or of a newer format; the message names it.
+      ValueError: the file is missing, damaged, too large or of a newer format; the message names
+        it.
     """
     path = Path(path)
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            content = {name: data[name] for name in data.files}
-            where = {name[1:]: content.pop(name).item() for name in data.files if name[0] == "@"}
-        content = {name: array.astype(np.float32) for name, array in content.items()}
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: unreadable ({str(error).splitlines()[0]})") from error
-    written = where.pop("format", None)
-    if written is not None and written > FORMAT:
-        raise ValueError(
-            f"{path}: format {written}, this version reads {FORMAT}: a newer tdanet_jax wrote it"
+    content = npz.read(path, links=False)
+    progress: dict[str, Any] = {}
+    for name in (*_WHERE, "format"):
+        value = content.pop(f"@{name}", None)
+        if value is None or value.shape != ():
+            raise FileError(path, "not a point of a run's history")
+        progress[name] = value.item()
+    written = int(jsons.number(path, progress.pop("format"), "format", 1e9))
+    if written > FORMAT:
+        raise FileError(
+            path, f"format {written}, this version reads {FORMAT}: a newer tdanet_jax wrote it"
         )
-    if written is None or where.keys() != _WHERE:
-        raise ValueError(f"{path}: not a point of a run's history")
-    weights = traverse_util.unflatten_dict(renamed(content, written), sep="/")
-    return Snapshot(weights=weights, **where)
+    for name, array in content.items():
+        if array.dtype.kind != "f":
+            raise FileError(path, f"{name} is not a parameter")
+    content = {name: array.astype(np.float32) for name, array in content.items()}
+    return snapshot(path, nested(path, renamed(content, written)), **progress)
 
 
-def checksums(path: Path | str) -> list[tuple[str, int]]:
-    """Name and checksum (CRC-32) of every array of a point, from the file's directory alone.
+def nested(path: Path, arrays: Mapping[str, Any]) -> Any:
+    """Nested dictionaries of arrays whose names are paths.
 
     Raises:
-      ValueError: the file is missing or damaged; the message names it.
+      FileError: a name has too many parts, or another array's name is its beginning.
     """
-    path = Path(path)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return [(entry.filename, entry.CRC) for entry in archive.infolist()]
-    except (OSError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: unreadable ({error})") from error
+    for name in arrays:
+        parts = name.split("/")
+        if len(parts) > DEEPEST or any("/".join(parts[:n]) in arrays for n in range(1, len(parts))):
+            raise FileError(path, f"{name} is not the name of a parameter")
+    return traverse_util.unflatten_dict(arrays, sep="/")
+
+
+def snapshot(path: Path, weights: Any, **progress: Any) -> Snapshot:
+    """A network that was read from a file, with the progress of its run.
+
+    Raises:
+      FileError: the progress is not what it must be; the message names the field.
+    """
+    for name, value in progress.items():
+        if name == "data_version":
+            if not isinstance(value, str) or not value.isprintable() or len(value) > 100:
+                raise FileError(path, f"{name} is not a version")
+            continue
+        least = jsons.number(path, value, name, 1e15)
+        if least < 0 or (type(value) is not int and name != "seconds"):
+            raise FileError(path, f"{name} is {value}: not a count")
+    return Snapshot(weights=weights, **progress)
+
+
+def check_fit(path: Path, weights: Any, expected: Any) -> None:
+    """Checks that a network has the parameters of the model that its configuration describes.
+
+    Args:
+      expected: the model's parameters, or their shapes alone.
+
+    Raises:
+      FileError: a name or a shape differs.
+    """
+    ours, theirs = (
+        {name: x.shape for name, x in traverse_util.flatten_dict(tree, sep="/").items()}
+        for tree in (weights, expected)
+    )
+    for name in sorted(ours.keys() | theirs.keys()):
+        if ours.get(name) != theirs.get(name):
+            raise FileError(
+                path,
+                f"does not fit the run's configuration: {name} is "
+                f"{ours.get(name, 'missing')}, not {theirs.get(name, 'a parameter')}",
+            )
 
 
 def points(run: Path | str) -> list[Path]:
-    """The files of a run's history, oldest first."""
+    """The files of a run's history, oldest first.
+
+    Raises:
+      FileError: the folder of the history is a link.
+    """
     run = Path(run)
-    return sorted(path for path in (run / FOLDER).glob(f"*{SUFFIX}") if path.stem.isdecimal())
+    regular.check_folder(run / FOLDER)
+    found = (run / FOLDER).glob(f"*{SUFFIX}")
+    return sorted(path for path in found if path.stem.isdecimal() and path.stem.isascii())
 
 
 def drop_after(run: Path | str, updates: int) -> None:
     """Deletes the points after a checkpoint: their updates will be done again."""
     run = Path(run)
+    found = points(run)  # an error if the folder is a link
     files.remove_partial(run / FOLDER)
-    for path in points(run):
+    for path in found:
         if int(path.stem) > updates:
             path.unlink()

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import jsons
 
 METRICS_FILE = "metrics.jsonl"
 
@@ -52,12 +52,19 @@ def read_metrics(folder: Path | str) -> list[Row]:
     """The rows of a run's `metrics.jsonl`; a line that was cut short or damaged is left out."""
     folder = Path(folder)
     rows = []
-    for line in (folder / METRICS_FILE).read_text(errors="replace").splitlines():
-        with contextlib.suppress(json.JSONDecodeError):
-            row = json.loads(line)
-            if isinstance(row, dict) and isinstance(row.get("updates"), int):
-                rows.append(row)
+    for _, row in jsons.load_lines(folder / METRICS_FILE, links=False):
+        if isinstance(row, dict) and _is_row(row):
+            rows.append(row)
     return rows
+
+
+def _is_row(row: Mapping[str, Any]) -> bool:
+    """Whether all fields of a row are finite numbers or None, and those of the budget are there."""
+    numbers = all(
+        value is None or (isinstance(value, int | float) and abs(value) < 1e300)
+        for value in row.values()
+    )
+    return numbers and all(type(row.get(name)) is int for name in ("updates", "steps", "episodes"))
 
 
 def tensorboard_sink(folder: Path | str) -> Callable[[Row], None]:

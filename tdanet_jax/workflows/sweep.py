@@ -15,9 +15,10 @@ from typing import Literal
 
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, OWN_TASK, TrainConfig
-from tdanet_jax.evaluation import comparison
+from tdanet_jax.evaluation import comparison, results_file
 from tdanet_jax.evaluation.comparison import Result
 from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import jsons, npz
 from tdanet_jax.splits import split_name
 
 #: Where the evaluated histories of a sweep's runs are kept.
@@ -97,22 +98,12 @@ def finished(folder: Path | str) -> FinishedRun:
 
     config = configs.load(folder / CONFIG_FILE)
     path = folder / RESULTS_FILE
-    try:
-        results = json.loads(files.read_text(path))
-        results["seen"]["L>=1"], *(results[name] for name in _READ)
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; the run is not finished") from None
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: not the results of a run ({error})") from None
+    if not path.exists():
+        raise ValueError(f"{path}: no such file; the run is not finished")
+    results = results_file.read(path)
     rows = read_metrics(folder) if (folder / METRICS_FILE).exists() else []
     results["settings"] = comparison.settings(config)
-    return FinishedRun(folder, config, results, rows[-1]["seconds"] if rows else None)
-
-
-#: What a report reads in a `results.json`, in addition to the groups' results.
-_READ = (
-    "split", "model", "policy", "seed", "data_version", "episodes_trained", "steps", "by_room"
-)  # fmt: skip
+    return FinishedRun(folder, config, results, rows[-1].get("seconds") if rows else None)
 
 
 def find(out: Path | str) -> list[FinishedRun]:
@@ -175,8 +166,11 @@ def evaluated_history(run: FinishedRun, out: Path | str) -> list[Result] | None:
     if not path.exists():
         return None
     try:
-        kept = json.loads(files.read_text(path))
+        kept = jsons.load(path, links=False)
         of, results = kept["of"], kept["results"]
+        for result in results if of == _fingerprint(run) else ():
+            results_file.check(path, result)
+            jsons.number(path, result["share"], "share", 1)
     except (ValueError, KeyError, TypeError):
         return None
     return results if of == _fingerprint(run) else None
@@ -186,7 +180,7 @@ def _fingerprint(run: FinishedRun) -> str:
     """Changes with the configuration, the rooms and the networks of the history."""
     from tdanet_jax.training import history
 
-    points = {path.name: history.checksums(path) for path in history.points(run.folder)}
+    points = {p.name: npz.checksums(p, links=False) for p in history.points(run.folder)}
     told = [configs.to_json(run.config), run.results["data_version"], points]
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from tdanet_jax.evaluation import comparison, paper
 from tdanet_jax.evaluation.comparison import Curve, Result, Spread
+from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.registry import MODELS
 from tdanet_jax.splits import UNSEEN
 from tdanet_jax.workflows.sweep import FinishedRun, evaluated_history, labels
@@ -166,7 +167,7 @@ def markdown(report: Report, figures: Mapping[str, str]) -> str:
     lines += _costs(report)
     lines += _runs(report)
     if absent := left_out(report):
-        lines += ["", "## Left out", "", *(f"- {line}" for line in absent)]
+        lines += ["", "## Left out", "", *(f"- {in_markdown(line)}" for line in absent)]
     return "\n".join(lines) + "\n"
 
 
@@ -175,7 +176,14 @@ def _comparison(report: Report, split: str) -> Iterator[str]:
     results = report.results(split)
     summaries = {label: comparison.summary(members) for label, members in results.items()}
     rows = [
-        ((f"{label} (ours)", str(len(out["seeds"])), _count(out["episodes_trained"])), out)
+        (
+            (
+                f"{in_markdown(label)} (ours)",
+                str(len(out["seeds"])),
+                _count(out["episodes_trained"]),
+            ),
+            out,
+        )
         for label, out in summaries.items()
     ]
     theirs = paper.rates(split)
@@ -196,7 +204,7 @@ def _by_room(report: Report, split: str) -> Iterator[str]:
     summaries = {k: comparison.summary(r) for k, r in results.items() if k != "shortest_path"}
     rooms = dict.fromkeys(room for out in summaries.values() for room in out["by_room"])
     rows = [
-        ((room, label), out["by_room"][room])
+        ((in_markdown(room), in_markdown(label)), out["by_room"][room])
         for room in rooms
         for label, out in summaries.items()
         if room in out["by_room"]
@@ -217,7 +225,9 @@ def _ablations(report: Report) -> Iterator[str]:
             for label in (label for label, model in models.items() if model in variants):
                 made_with = MODELS[models[label]][1]
                 parts = ["no" if made_with.get(p) is False else "yes" for p in _ABLATED]
-                rows.append(((split, label, *parts), comparison.summary(results[label])))
+                rows.append(
+                    ((split, in_markdown(label), *parts), comparison.summary(results[label]))
+                )
     if rows:
         yield from ("", "## Ablations (the paper's Tables IV and V)", "")
         yield from comparison.table(("Split", "Model", *_ABLATED.values()), rows)
@@ -236,7 +246,7 @@ def _costs(report: Report) -> Iterator[str]:
     for label, cost in sorted(report.costs.items(), key=lambda item: _place(item[1].model)):
         published = paper.PARAMETERS.get(paper.NAMES.get(cost.model, ""))
         cells = [
-            label,
+            in_markdown(label),
             f"{cost.parameters:,}",
             f"{cost.parameters / 2**20:.2f}",
             "-" if published is None else f"{published:.2f}",
@@ -253,7 +263,7 @@ def _runs(report: Report) -> Iterator[str]:
     rows = [
         (
             (
-                run.folder.name,
+                in_markdown(run.folder.name),
                 str(run.results["seed"]),
                 f"{run.results['episodes_trained']:,}",
                 f"{run.results['steps']:,}",

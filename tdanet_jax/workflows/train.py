@@ -16,6 +16,7 @@ from tdanet_jax.config import CONFIG_FILE, OWN_TASK, WORD_VECTORS_FILE, TrainCon
 from tdanet_jax.evaluation import episodes, policies, report, rollout
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import regular
 from tdanet_jax.models.factory import unused_flags
 from tdanet_jax.task import load_task, resolve
 from tdanet_jax.training import checkpoint, devices
@@ -154,6 +155,7 @@ def _check_longer(run: Run) -> None:
 def _prepare(run: Run, callbacks: Callbacks) -> None:
     """Writes what a run's folder holds from the start."""
     folder, task = run.folder, run.task
+    regular.check_tree(folder)  # where a link leads, nothing is written or deleted
     for path in files.remove_partial(folder) + files.remove_partial(folder / checkpoint.FOLDER):
         callbacks.on_note(f"removed {path}: half-written when the run was stopped")
     if run.config.word_vectors is not None and not (folder / WORD_VECTORS_FILE).exists():

@@ -103,9 +103,9 @@ def test_damaged_records_are_refused_by_line(some_rooms, opinionated_run, tmp_pa
         "'Jump': no action; there are MoveAhead": good | {"actions": ["Jump"]},
         "no actions": good | {"actions": []},
         "no such room": good | {"scene": "FloorPlan999"},
-        "'x'": {key: value for key, value in good.items() if key != "x"},
-        "could not convert": good | {"z": "north"},
-        "indices must be": [1, 2],
+        "x is not a number": {key: value for key, value in good.items() if key != "x"},
+        "z is not a number": good | {"z": "north"},
+        "not the record of an episode": [1, 2],
     }
     far = good | {"x": good["x"] + 0.02}
     lines = [json.dumps(row) for row in [*bad.values(), far]] + ["{"]

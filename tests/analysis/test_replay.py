@@ -12,6 +12,7 @@ import pytest
 from tdanet_jax.analysis import replay, trace
 from tdanet_jax.analysis.trace import Player
 from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.io import escaping
 from tdanet_jax.scenes import camera_view
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.vocabulary import ROOM_TYPES
@@ -74,7 +75,7 @@ def test_traces_of_different_episodes_are_refused(traces, some_rooms):
 
 
 def test_no_name_ends_the_script():
-    text = replay.embed({"name": HOSTILE[0], "entity": "&lt;", "line": "a\u2028b"})
+    text = escaping.in_script({"name": HOSTILE[0], "entity": "&lt;", "line": "a\u2028b"})
     assert "<" not in text
     assert ">" not in text
     assert "&" not in text

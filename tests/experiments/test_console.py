@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
 import os
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -181,3 +183,32 @@ def test_a_command_runs_in_a_thread(capsys: pytest.CaptureFixture[str]) -> None:
     assert isinstance(error, SystemExit)
     assert error.code == 2
     assert capsys.readouterr().err == "error: --policy random takes no --checkpoint\n"
+
+
+def test_names_from_files_are_printed_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    """No markup, no escape sequences, and one line for an error or a warning."""
+    console.console.print("[/x] [red]a[/red]\x1b[2J")
+    with console.reporter("[/y]") as show:
+        show(0.5, "[/z]\x07")
+    assert capsys.readouterr().out == "[/x] [red]a[/red]?[2J\n[/y]  50.0 %  [/z]?\n"
+    with console.one_line_errors():
+        warnings.warn("[/x]\x1b[2J\nwarning: more", stacklevel=1)
+    with pytest.raises(SystemExit), console.one_line_errors():
+        raise ValueError("[/x]\x1b[2J\nerror: more")
+    assert capsys.readouterr().err == (
+        "warning: [/x]?[2J warning: more\nerror: [/x]?[2J error: more\n"
+    )
+
+
+def test_a_bar_shows_names_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = io.StringIO()
+    terminal = console._PlainConsole(
+        file=written, force_terminal=True, highlight=False, markup=False, width=120
+    )
+    monkeypatch.setattr(console, "console", terminal)
+    with console.reporter("rooms") as show:
+        show(1.0, "[/z]\x07")
+        terminal.print("[/x]\x1b]0;title\x07")
+    assert "[/z]?" in written.getvalue()
+    assert "[/x]?]0;title?" in written.getvalue()
+    assert "\x07" not in written.getvalue()

@@ -165,8 +165,9 @@ def test_an_interrupted_import_continues_where_it_stopped(
         assert len(list((tmp_path / "parts").iterdir())) == 2
     killed = subprocess.Popen([sys.executable, "-c", ""])
     killed.wait()
-    left = f"{files.PARTIAL}{killed.pid}-rooms.features.npy"
-    Path(left).write_bytes(b"half")
+    left = f"{files.PARTIAL}{killed.pid}-x"
+    Path(left).mkdir()
+    Path(left, "rooms.features.npy").write_bytes(b"half")
     capsys.readouterr()
     scenes.main(command)
     assert f"removed {left}: half-written" in capsys.readouterr().out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -56,13 +57,45 @@ def test_partial_files_of_killed_processes_are_removed(tmp_path: Path) -> None:
     killed.wait()
     begun = files.PARTIAL + str(killed.pid)
     kept = {
-        "a.npz", "a.npz-b", f"{files.PARTIAL}{os.getpid()}-a.npz", f"{files.PARTIAL}1-a.npz",
-        f"{files.PARTIAL}a.npz", f"{begun}-b-a.npz", f"{begun}-aXnpz", f"{begun}-a.npz.b",
+        f"{files.PARTIAL}{os.getpid()}-x/a.npz", f"{files.PARTIAL}1-x/a.npz",
+        f"{files.PARTIAL}x/a.npz", f"{begun}-x-y/a.npz", f"{begun}-y/aXnpz",
     }  # fmt: skip
-    for name in (*kept, f"{begun}-a.npz"):
+    for name in (*kept, f"{begun}-z/a.npz"):
+        (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_text("half")
-    (tmp_path / f"{begun}-out" / "FloorPlan1").mkdir(parents=True)
-    assert files.remove_abandoned(tmp_path / "a.npz") == [tmp_path / f"{begun}-a.npz"]
-    assert files.remove_abandoned(tmp_path / "out") == [tmp_path / f"{begun}-out"]
-    assert {path.name for path in tmp_path.iterdir()} == kept
+    (tmp_path / f"{begun}-o" / "out" / "FloorPlan1").mkdir(parents=True)
+    assert files.remove_abandoned(tmp_path / "a.npz") == [tmp_path / f"{begun}-z"]
+    assert files.remove_abandoned(tmp_path / "out") == [tmp_path / f"{begun}-o"]
+    assert {str(p.relative_to(tmp_path)) for p in tmp_path.glob("*/*")} == kept
     assert files.remove_abandoned(tmp_path / "missing" / "a.npz") == []
+
+
+def test_nobody_else_can_put_a_link_where_a_file_is_being_written(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    with files.replacing(path) as fresh:
+        assert fresh.name == path.name  # its ending says in which format a picture is written
+        assert stat.S_IMODE(fresh.parent.stat().st_mode) == 0o700
+        first = fresh.parent.name
+        fresh.write_text("new")
+    with files.replacing(path) as fresh:
+        assert fresh.parent.name != first
+        fresh.write_text("newer")
+    usual = tmp_path / "usual"
+    usual.write_text("")
+    assert path.stat().st_mode == usual.stat().st_mode  # others may read it as any other file
+
+
+def test_links_are_removed_and_locked_as_links(tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (victim / "a").write_text("kept")
+    run = tmp_path / "run"
+    run.mkdir()
+    for name in (f"{files.PARTIAL}1", f"{files.PARTIAL}{2**22 + 1}-x"):
+        (run / name).symlink_to(victim)
+    assert files.remove_abandoned(run / "a") == []
+    assert len(files.remove_partial(run)) == 2
+    (run / files.LOCK_FILE).symlink_to(victim / "a")
+    with pytest.raises(OSError, match="link"), files.locked(run):
+        pass
+    assert [(p.name, p.read_text()) for p in victim.iterdir()] == [("a", "kept")]

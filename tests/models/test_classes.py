@@ -68,6 +68,15 @@ def test_an_old_file_without_a_graph_is_loaded(tmp_path: Path) -> None:
         '{"names": ["Apple"]}',
         '{"names": ["Apple"], "known": [0], "edges": [[0, 0]]}',
         '{"names": ["Apple"], "known": [0], "edges": [[0, 0, "x"]]}',
+        '{"names": ["Apple"], "known": [0], "edges": [[0, 0, -1]]}',
+        '{"names": ["Apple"], "known": [0], "edges": [[0, 0, 1e400]]}',
+        '{"names": ["Apple", "Mug"], "known": [0], "edges": [[0, 1, 1]]}',
+        '{"names": ["Apple"], "known": [0, 0]}',
+        '{"names": ["Apple"], "known": [1]}',
+        '{"names": ["Apple"], "known": [true]}',
+        '{"names": ["Apple"], "known": [[]]}',
+        '{"names": ["\\u001b[2J"], "known": [0]}',
+        '{"names": 3, "known": [0]}',
     ],
 )
 def test_a_damaged_file_is_one_clear_error(tmp_path: Path, content: str) -> None:

@@ -77,7 +77,37 @@ BREAKS: list[tuple[str, Any]] = [
     ("classes", lambda a: (3,) * len(a)),
     ("classes", lambda a: a[:1]),
     ("object_id", lambda a: a[:-1]),
+    # Names that would become paths, or write to the terminal.
+    ("scenes", lambda a: ("../../escaped", *a[1:])),
+    ("scenes", lambda a: ("/escaped", *a[1:])),
+    ("targets", lambda a: ("../../escaped", *a[1:])),
+    ("classes", lambda a: ("a\x1b[2J", *a[1:])),
+    ("object_id", lambda a: ("a\x1b[2J", *a[1:])),
+    ("scenes", lambda a: (*a[:-1], a[0])),
+    ("classes", lambda a: (*a[:-1], a[0])),
+    ("position", lambda a: a + 1e9),
+    ("object_box", lambda a: a * np.inf),
+    ("distance", lambda a: a - 9),
+    ("field_of_view", lambda a: "wide"),
+    ("camera_height", lambda a: -1.0),
+    ("image", lambda a: 10**9),
+    ("subpixel", lambda a: "16"),
 ]
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"parents": {"attic": {}}}, {"parents": {"kitchen": {"Mug": {"Sink": "1"}}}},
+     {"parents": {"kitchen": {"Mug": {"Sink": 10**400}}}}, {"parts": {"Room1": "both"}},
+     {"episodes": [["test", "Room1", "0", 0, 0, 0, "Mug"]]}, {"episodes": [["test", "Room1"]]},
+     {"episodes": [["test", 1, 0, 0, 0, 0, "Mug"]]}, {"graph_classes": ["a"]}, {"parents": [1]}],
+)  # fmt: skip
+def test_odd_extras_are_refused(rooms: SceneTables, tmp_path: Path, values: Any) -> None:
+    path, empty = tmp_path / "rooms.npz", np.zeros((0, 0), np.float32)
+    arrays = {**rooms.to_arrays(), "extras/notes": notes(**values), "extras/adjacency": empty}
+    archive.write(path, arrays)
+    with pytest.raises(FileError, match=r"rooms\.npz: not a file of rooms \("):
+        dataset.load_rooms(path)
 
 
 @pytest.mark.parametrize("case", range(len(BREAKS)))

@@ -95,7 +95,7 @@ def test_a_table_of_rooms(tmp_path: Path) -> None:
      ("name,room_type\n../up,kitchen\n", r"line 2: room name '\.\./up': is a path"),
      ("name,room_type\nLab,kitchen\nLab,bedroom\n", "line 3: Lab is listed twice"),
      ('name,room_type\n"Lab,kitchen\n', "not a CSV table"),
-     ("name,room_type\n\xff", "not a CSV table")],
+     ("name,room_type\n\xff", "not UTF-8")],
 )  # fmt: skip
 def test_broken_tables(tmp_path: Path, text: str, reason: str) -> None:
     path = tmp_path / "rooms.csv"

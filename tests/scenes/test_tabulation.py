@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
 
+import numpy as np
 import pytest
 
 from tdanet_jax.scenes import SceneError, tabulation
 from tdanet_jax.scenes.visibility.rules import RULES
+from tdanet_jax.scenes.visibility.solids import near_any
 from tests.support import toy
 
 
@@ -49,3 +52,52 @@ def test_a_room_in_which_nothing_is_seen() -> None:
     assert len(t.row_object) == 0
     assert (t.distance == -1).all()
     assert not t.visible_bits().any()
+
+
+def test_painting_in_batches_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    low = rng.integers(0, 4000, (300, 2))
+    box = np.concatenate([low, low + rng.integers(0, 800, (300, 2))], axis=1).astype(np.int16)
+    state, label = np.sort(rng.integers(0, 40, 300)), rng.integers(0, 100, 300)
+    whole = tabulation.paint(state, box, label, 41, 4800)
+    assert len(np.unique(whole)) > 50
+    for size in (1, 7, 64, 299):
+        monkeypatch.setattr(tabulation, "BOXES", size)
+        np.testing.assert_array_equal(tabulation.paint(state, box, label, 41, 4800), whole)
+    none = np.zeros(0, np.int64)
+    assert (tabulation.paint(none, np.zeros((0, 4)), none, 2, 4800) == -1).all()
+
+
+@pytest.mark.parametrize(
+    ("budget", "reason"), [("patches=10", r"\d+ patches up to object Apple\|0, more than 10"),
+                           ("tests=10", r"\d+ pairs of a line of sight and a box, more than 10")],
+)  # fmt: skip
+def test_rooms_beyond_a_budget_are_refused_before_they_are_computed(
+    monkeypatch: pytest.MonkeyPatch, budget: str, reason: str
+) -> None:
+    monkeypatch.setenv("TDANET_BUDGETS", budget)
+    with pytest.raises(SceneError, match=f"Corridor: {reason}; .* TDANET_BUDGETS"):
+        tabulation.build([toy.corridor()])
+
+
+def test_progress_ends_with_all_rooms() -> None:
+    shown: list[tuple[float, int]] = []
+    tabulation.build(toy.random_rooms(2)[:3], progress=lambda *pair: shown.append(pair))
+    assert shown == sorted(shown)
+    assert shown[-1] == (3, 3)
+
+
+def test_a_huge_object_takes_little_memory() -> None:
+    room = toy.room(toy.line(4), toy.thing("Sofa", (0.0, 1.0, 2.0), (900.0, 1.0, 1.0)))
+    tracemalloc.start()
+    tabulation.build([room])
+    assert tracemalloc.get_traced_memory()[1] < 200 << 20
+    tracemalloc.stop()
+
+
+def test_a_carved_object_among_many_points_takes_little_memory() -> None:
+    places = np.zeros((20_000, 3))
+    tracemalloc.start()
+    assert near_any(np.zeros((4096, 3)), places, 0.1).all()
+    assert tracemalloc.get_traced_memory()[1] < 400 << 20
+    tracemalloc.stop()

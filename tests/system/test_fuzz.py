@@ -1,25 +1,74 @@
 """Mutated files: whatever is wrong with an untrusted file ends in one clear line.
 
-The fast tier tries a few hundred mutations, `pytest -m slow tests/system/test_fuzz.py` 12,000.
+Memory and time are measured as well. The fast tier tries some hundred mutations,
+`pytest -m slow tests/system/test_fuzz.py` 10,000 of each kind of file.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import pickle
+import shutil
+import time
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tdanet_jax import config as configs
 from tdanet_jax import words
-from tdanet_jax.io.untrusted import FileError, hdf5, pickles
-from tdanet_jax.scenes import dataset
+from tdanet_jax.analysis import episode_lookup
+from tdanet_jax.evaluation import comparison, results_file
+from tdanet_jax.io.untrusted import hdf5, pickles
+from tdanet_jax.models.classes import load_vocabulary
+from tdanet_jax.scenes import dataset, metadata
 from tdanet_jax.scenes.offline import extras, importer, layout, reader
-from tests.support import original
+from tdanet_jax.training import history, journal
+from tdanet_jax.training.checkpoint import Checkpoints
+from tests.support import handmade, original
+
+MOST_MEMORY, MOST_SECONDS = 100 << 20, 10.0  # of one small file
+#: Values in place of others; "@" becomes 1e400.
+ODD: list[Any] = [
+    10**400, -(10**400), "@", -1, 0, 0.5, 10**9, 2**63, 1e308, True, None, "", "x" * 300,
+    "../../escaped", "/escaped", "a\x1b[2Jb", "[/x]", "$a$|<b>", "\ud800", [], {}, [[]], {"a": {}},
+    [[[[[[[[[[1]]]]]]]]]], [None], {"": None},
+]  # fmt: skip
+SCENE = {
+    "name": "Attic",
+    "room_type": "bedroom",
+    "objects": [
+        {
+            "objectId": "Mug|1",
+            "objectType": "Mug",
+            "axisAlignedBoundingBox": {
+                "center": {"x": 0, "y": 1, "z": 1},
+                "size": {"x": 0.1, "y": 0.1, "z": 0.1},
+            },
+            "rotation": {"x": 0, "y": 90, "z": 0},
+            "parentReceptacles": ["Table|1"],
+            "visible": True,
+        }
+    ],
+    "reachable_positions": [{"x": 0, "y": 0.9, "z": 0}, {"x": 0, "y": 0.9, "z": 0.25}],
+    "gridSize": 0.25,
+    "rotateStepDegrees": 45,
+    "horizons": [0, 30],
+    "split": "train",
+    "agent": {
+        "position": {"x": 0, "y": 0.9, "z": 0},
+        "rotation": {"x": 0, "y": 90, "z": 0},
+        "cameraHorizon": 0,
+    },
+}
+OLD_RUN = Path(__file__).parents[1] / "data" / "run_format_1_best"
+BUNDLED = Path(__file__).parents[2] / "agents" / "18-4-best"
 
 edits = st.lists(
     st.tuples(
@@ -51,6 +100,24 @@ def mutate(data: bytes, changes: list[tuple[str, float, bytes]]) -> bytes:
     return data
 
 
+def with_odd(data: bytes, share: float, value: object) -> bytes:
+    """A JSON document (or the first line of several) in which one value is replaced."""
+    content = json.loads(data.splitlines()[0] if b"}\n{" in data else data)
+    places: list[tuple[Any, Any]] = []
+
+    def visit(node: Any) -> None:
+        members = node.items() if isinstance(node, dict) else enumerate(node)
+        for key, inner in members:
+            places.append((node, key))
+            if isinstance(inner, dict | list):
+                visit(inner)
+
+    visit(content)
+    node, key = places[int(share * len(places))]
+    node[key] = value
+    return json.dumps(content).replace('"@"', "1e400").encode()
+
+
 def read_scene(path: Path) -> None:
     reader.read_scene(path.parent, "FloorPlan1", 0)
 
@@ -77,8 +144,33 @@ def read_features(path: Path) -> None:
 GRID = layout.Grid(np.array([[p["x"], p["y"], p["z"]] for p in original.POINTS]))
 
 
+def read_config(path: Path) -> None:
+    configs.load(path)
+
+
+def read_classes(path: Path) -> None:
+    load_vocabulary(path.parent).normalised_adjacency()
+
+
+def read_metrics(path: Path) -> None:
+    journal.read_metrics(path.parent)
+
+
+def read_results(path: Path) -> None:
+    comparison.summary([results_file.read(path)])
+
+
+def read_record(path: Path) -> None:
+    episode_lookup.read_record(path.parent, 0, handmade.lopsided())
+
+
+def read_checkpoint(path: Path) -> None:
+    run = next(folder.parent for folder in path.parents if folder.name == "checkpoints")
+    Checkpoints(run).snapshot()
+
+
 def seeds(root: Path) -> list[tuple[Path, Callable[[Path], object]]]:
-    """Good files, and what reads each."""
+    """Good files of every kind, and what reads each."""
     scenes = original.write_all(root)
     with original.fake_torch():
         tensors = [original.Tensor(np.arange(9), 1, (2, 3), (1, 2)), np.eye(3)]
@@ -87,6 +179,7 @@ def seeds(root: Path) -> list[tuple[Path, Callable[[Path], object]]]:
     dataset.save_rooms(importer.read_folder(scenes, lambda share, line: None), root / "rooms.npz")
     room = scenes / "FloorPlan1"
     names = ("grid.json", "graph.json", "visible_object_map.json", "objects_bb.json")
+    (root / "scenes.json").write_text(json.dumps(SCENE))
     return [
         *((room / name, read_scene) for name in names),
         (root / "data" / "c2p_prob.json", extras.read_parents),
@@ -95,7 +188,34 @@ def seeds(root: Path) -> list[tuple[Path, Callable[[Path], object]]]:
         (root / "tensors.pkl", read_tensor),
         (root / "rooms.npz", dataset.load_rooms),
         (root / "glove.txt", words.load_word_vectors),
+        (root / "scenes.json", metadata.read_scenes),
+        *run_files(root / "run"),
         *feature_files(root),
+    ]
+
+
+def run_files(run: Path) -> list[tuple[Path, Callable[[Path], object]]]:
+    """The files of a run's folder, and what reads each."""
+    shutil.copytree(OLD_RUN, run)
+    (run / "checkpoints" / "6" / "SHA256SUMS").unlink()  # whoever sends a run can write them anew
+    record = {"scene": "Room0", "target": "Mug", "x": 0, "z": 0, "rotation": 0, "horizon": 0,
+              "L": 1, "actions": ["Done"]}  # fmt: skip
+    (run / "episodes.jsonl").write_text(json.dumps(record) + "\n")
+    shutil.copyfile(BUNDLED / "results.json", run / "results.json")
+    where = {"updates": 7, "episodes": 5, "seconds": 0.5, "point": 1, "data_version": "x"}
+    point = history.write(run, history.Snapshot({"a": {"b": np.ones(3, np.float32)}}, **where))
+    state = run / "checkpoints" / "6" / "state"
+    return [
+        (run / "config.json", read_config),
+        (run / "classes.json", read_classes),
+        (run / "metrics.jsonl", read_metrics),
+        (run / "results.json", read_results),
+        (run / "episodes.jsonl", read_record),
+        (point, history.read),
+        (run / "checkpoints" / "6" / "meta" / "metadata", read_checkpoint),
+        (state / "_METADATA", read_checkpoint),
+        (state / "manifest.ocdbt", read_checkpoint),
+        (next((state / "d").iterdir()), read_checkpoint),
     ]
 
 
@@ -110,36 +230,67 @@ def feature_files(root: Path) -> list[tuple[Path, Callable[[Path], object]]]:
     return []
 
 
+class Seeds(list):
+    """Whose names alone are printed with a failure."""
+
+    def __repr__(self) -> str:
+        return str([path.name for path, *_ in self])
+
+
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> list:
+def good(tmp_path_factory: pytest.TempPathFactory) -> Seeds:
     root = tmp_path_factory.mktemp("fuzz")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TDANET_CACHE", str(root / "cache"))
-        return [(path, path.read_bytes(), read) for path, read in seeds(root)]
+        return Seeds((path, path.read_bytes(), read) for path, read in seeds(root))
 
 
-def check(good: list, which: int, changes: list[tuple[str, float, bytes]]) -> None:
-    path, data, read = good[which % len(good)]
-    path.write_bytes(mutate(data, changes))
+def check(path: Path, data: bytes, content: bytes, read: Callable[[Path], object]) -> None:
+    """Reads other content in place of a good file: in bounded time and memory, or in one line."""
+    path.write_bytes(content)
     refusal = ""
+    tracemalloc.start()
+    before = time.process_time()
     try:
         read(path)
-    except FileError as error:
+    except ValueError as error:
         refusal = str(error)
     finally:
         path.write_bytes(data)
+        peak, seconds = tracemalloc.get_traced_memory()[1], time.process_time() - before
+        tracemalloc.stop()
     assert refusal.isprintable()
-    assert not refusal or str(path.parent) in refusal
+    assert not refusal or str(path.parent) in refusal or "checkpoints/6" in refusal
+    assert peak < MOST_MEMORY
+    assert seconds < MOST_SECONDS
 
 
-@given(st.integers(0, 10), edits)
-@settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
-def test_a_few_mutations(good: list, which: int, changes: list[tuple[str, float, bytes]]) -> None:
-    check(good, which, changes)
+@given(st.integers(0, 21), edits)
+@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+def test_a_few_mutations(good: Seeds, which: int, changes: list[tuple[str, float, bytes]]) -> None:
+    path, data, read = good[which % len(good)]
+    check(path, data, mutate(data, changes), read)
+
+
+@given(st.integers(0, 21), st.floats(0, 1, exclude_max=True), st.sampled_from(ODD))
+@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+def test_a_few_odd_values(good: Seeds, which: int, share: float, value: object) -> None:
+    texts = [item for item in good if item[0].suffix in (".json", ".jsonl")]
+    path, data, read = texts[which % len(texts)]
+    check(path, data, with_odd(data, share, value), read)
 
 
 @pytest.mark.slow
-@given(st.integers(0, 10), edits)
-@settings(max_examples=12_000, suppress_health_check=[HealthCheck.too_slow])
-def test_many_mutations(good: list, which: int, changes: list[tuple[str, float, bytes]]) -> None:
-    check(good, which, changes)
+@pytest.mark.parametrize("which", range(22))
+def test_many_mutations(good: Seeds, which: int) -> None:
+    """10,000 of each kind; of checkpoints, which take longer, 1,000."""
+    path, data, read = good[which % len(good)]
+    count = 1_000 if read is read_checkpoint else 10_000
+
+    @given(edits, st.floats(0, 1, exclude_max=True), st.none() | st.sampled_from(ODD))
+    @settings(max_examples=count, suppress_health_check=[HealthCheck.too_slow])
+    def mutated(changes: list[tuple[str, float, bytes]], share: float, value: object) -> None:
+        odd = value is not None and path.suffix in (".json", ".jsonl")
+        check(path, data, with_odd(data, share, value) if odd else mutate(data, changes), read)
+
+    mutated()

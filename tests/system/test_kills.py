@@ -25,6 +25,7 @@ from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.training.journal import METRICS_FILE, read_metrics
 from tests.support import command
+from tests.support.checkpoints import arrays_of
 
 KILLS = 24
 #: 600 chunks, more than a fast machine gets done between the kills; a checkpoint follows each.
@@ -77,8 +78,7 @@ def assert_sound(out: Path, before: int) -> int:
 
 def final_state(out: Path) -> list[np.ndarray]:
     """Everything in the newest checkpoint."""
-    state, _ = Checkpoints(out)._read(None)
-    return [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
+    return list(arrays_of(out).values())
 
 
 def without_times(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -18,6 +18,7 @@ import pytest
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import orbax
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.factory import make_model
@@ -212,3 +213,42 @@ def test_a_checkpoint_of_another_network_is_refused(saved: Checkpoints) -> None:
     config = dataclasses.replace(LearnerConfig(), num_envs=4)
     with pytest.raises(ValueError, match="unreadable checkpoint"):
         saved.restore(lambda: init(jax.random.key(0), config, wider, WORDS, PARAMS))
+
+
+@pytest.mark.parametrize("budget", ["unpacked=1000", "arrays=3"])
+def test_budgets_hold_before_any_array_is_read(
+    saved: Checkpoints, monkeypatch: pytest.MonkeyPatch, budget: str
+) -> None:
+    def read(*_: object, **__: object) -> None:
+        raise AssertionError("the arrays are read")
+
+    monkeypatch.setattr(orbax.Stored, "read", read)
+    monkeypatch.setenv("TDANET_BUDGETS", budget)
+    with pytest.raises(ValueError, match=r"2: unreadable checkpoint \(.* more than \d+; if"):
+        saved.snapshot()
+
+
+def test_the_shapes_of_another_network_are_seen_before_any_array_is_read(
+    saved: Checkpoints, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(*_: object, **__: object) -> None:
+        raise AssertionError("the arrays are read")
+
+    monkeypatch.setattr(orbax.Stored, "read", read)
+    config = LearnerConfig(num_envs=4)
+    with pytest.raises(ValueError, match=r"unreadable checkpoint \(.* is float32\(.*, not"):
+        saved.restore(lambda: init(jax.random.key(0), config, network(9), WORDS, PARAMS))
+
+
+@pytest.mark.parametrize(
+    "meta",
+    [{}, {"seconds": "1", "data_version": "d"}, {"seconds": 10**400, "data_version": "d"},
+     {"seconds": -1.0, "data_version": "d"}, {"seconds": 1.0}, {"seconds": 1.0, "data_version": 3},
+     {"seconds": 1.0, "data_version": "\x1b[2J"}],
+)  # fmt: skip
+def test_odd_progress_is_one_clear_line(tmp_path: Path, meta: dict) -> None:
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(after(1), meta)
+    with pytest.raises(ValueError, match=r"checkpoints/1: (seconds|data_version) is ") as caught:
+        checkpoints.snapshot()
+    assert str(caught.value).isprintable()

@@ -42,7 +42,7 @@ def test_points_are_in_order_and_those_behind_a_checkpoint_are_dropped(tmp_path)
 def test_a_damaged_file_is_named_in_one_line(tmp_path, content):
     path = tmp_path / "00000001.npz"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"00000001\.npz: unreadable") as caught:
+    with pytest.raises(ValueError, match=r"00000001\.npz: not an npz archive") as caught:
         history.read(path)
     assert "\n" not in str(caught.value)
 
@@ -50,7 +50,7 @@ def test_a_damaged_file_is_named_in_one_line(tmp_path, content):
 def test_a_cut_file_is_named(tmp_path):
     path = history.write(tmp_path, SNAPSHOT)
     path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(ValueError, match=r"00000120\.npz: unreadable"):
+    with pytest.raises(ValueError, match=r"00000120\.npz: not an npz archive"):
         history.read(path)
 
 
@@ -83,3 +83,35 @@ def test_every_point_falls_due_once_and_in_order(steps, points):
         assert due[-1] == points
     if max(steps) * points < 1 <= points and shares[-1] >= 1:
         assert due == list(range(1, points + 1))
+
+
+def test_parameters_must_fit_the_configuration(tmp_path):
+    path = history.write(tmp_path, SNAPSHOT)
+    weights = history.read(path).weights
+    history.check_fit(path, weights, WEIGHTS)
+    other = {"actor": {"kernel": np.zeros((2, 3)), "bias": np.zeros(2)}, "encoder": {}}
+    for one, two, message in (
+        (weights, other, r"actor/kernel is \(2, 2\), not \(2, 3\)"),
+        (other, weights, r"actor/kernel is \(2, 3\), not \(2, 2\)"),
+        (weights, {}, r"actor/bias is \(2,\), not a parameter"),
+        ({}, weights, r"actor/bias is missing, not \(2,\)"),
+    ):
+        with pytest.raises(ValueError, match=f"does not fit the run's configuration: {message}"):
+            history.check_fit(path, one, two)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"@updates": np.array("7")}, {"@updates": np.array(0.5)}, {"@episodes": np.array(-1)},
+     {"@seconds": np.array(np.nan)}, {"@point": np.zeros(3)}, {"@data_version": np.array(3)},
+     {"@data_version": np.array("\x1b[2J")}, {"@format": np.array("x")}, {"actor": np.ones(3)},
+     {"/".join("a" * 30): np.ones(3)}, {"actor/bias": np.array(["text"])}],
+)  # fmt: skip
+def test_odd_fields_are_named_in_one_line(tmp_path, change):
+    path = history.write(tmp_path, SNAPSHOT)
+    with np.load(path) as data:
+        content = dict(data)
+    np.savez(path, **{**content, **change})
+    with pytest.raises(ValueError, match=r"00000120\.npz: ") as caught:
+        history.read(path)
+    assert str(caught.value).isprintable()

@@ -23,12 +23,13 @@ from tdanet_jax.evaluation import episodes, policies, rollout
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.task import Task, make_task
-from tdanet_jax.training.checkpoint import FORMAT, Checkpoints, newest
+from tdanet_jax.training.checkpoint import FORMAT, newest
 from tdanet_jax.training.renames import renamed
 from tdanet_jax.training.run import Run
 from tdanet_jax.vocabulary import Action
 from tdanet_jax.words import WordVectors
 from tests.support import samples
+from tests.support.checkpoints import arrays_of
 
 DATA = Path(__file__).parents[1] / "data"
 #: With odometry and triangulation; and a network that adapts, in the middle of its episodes.
@@ -57,9 +58,7 @@ def test_all_its_arrays_are_known_by_the_names_of_today(run: Path, task: Task) -
     state = Run(run, configs.load(run / CONFIG_FILE), task).state
     known = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf
              for path, leaf in jax.tree_util.tree_leaves_with_path(state)}  # fmt: skip
-    found, _ = Checkpoints(run)._read(None)
-    for path, leaf in jax.tree_util.tree_leaves_with_path(found):
-        name = jax.tree_util.keystr(path, simple=True, separator="/")
+    for name, leaf in arrays_of(run).items():
         if name != "key":
             np.testing.assert_array_equal(known[name], leaf, err_msg=name)
 
@@ -73,11 +72,7 @@ def test_it_resumes_and_is_saved_with_the_names_of_today(run: Path, task: Task) 
     [row] = again.chunks()
     assert row["updates"] == updates + 1
     again.save()
-    state, _ = Checkpoints(run)._read(None)
-    leaves = {
-        jax.tree_util.keystr(path, simple=True, separator="/"): np.asarray(leaf, np.float64)
-        for path, leaf in jax.tree_util.tree_leaves_with_path(state)
-    }
+    leaves = {name: leaf.astype(np.float64) for name, leaf in arrays_of(run).items()}
     assert all(np.isfinite(leaf).all() for leaf in leaves.values())
     assert leaves.keys() == renamed(expected(run)["norms"], 1).keys()
     meta = json.loads((run / f"checkpoints/{row['updates']}/meta/metadata").read_text())
@@ -108,7 +103,5 @@ def test_its_agent_decides_as_in_the_old_code(tmp_path: Path) -> None:
 
 
 def test_new_names_stay_as_they_are() -> None:
-    state, _ = Checkpoints(DATA / NAMES[1])._read(None)
-    leaves = jax.tree_util.tree_leaves_with_path(state)
-    names = {jax.tree_util.keystr(path, simple=True, separator="/"): 0 for path, _ in leaves}
+    names = dict.fromkeys(arrays_of(DATA / NAMES[1]), 0)
     assert renamed(names, 1) == renamed(names, 2) == names

@@ -83,7 +83,7 @@ def test_only_finished_runs_are_found_and_damaged_results_are_named(tmp_path):
     found = sweep.find(tmp_path)
     assert [(run.folder, run.config, run.seconds) for run in found] == [(folder, done, None)]
     (folder / "results.json").write_text("{")
-    with pytest.raises(ValueError, match=r"results\.json: not the results of a run"):
+    with pytest.raises(ValueError, match=r"results\.json: not JSON"):
         sweep.find(tmp_path)
     with pytest.raises(ValueError, match="the run is not finished"):
         sweep.finished(tmp_path / configs.run_name(BASE))

@@ -90,7 +90,7 @@ def opened(path: Path) -> Iterator[Reader]:
     import h5py
 
     if not path.is_file():
-        raise FileError(path, "no such file")
+        raise FileError(path, "not a regular file" if path.exists() else "no such file")
     with _plain_errors(path):
         file = h5py.File(path, "r", locking=False)
     with file:

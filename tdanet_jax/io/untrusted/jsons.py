@@ -3,29 +3,70 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
-from tdanet_jax.io import files
-from tdanet_jax.io.untrusted import FileError
+import numpy as np
 
-#: Bytes of the largest file that is read; the raw metadata of one scene is some hundred million.
-LARGEST = 2 << 30
+from tdanet_jax.io.untrusted import FileError, regular
+from tdanet_jax.io.untrusted.budgets import excess
+
 _SPACE = " \t\n\r"
+#: Strings, whether or not they end; what is left of a document without them shows its nesting.
+_STRINGS = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
+_NOT_BRACKETS = re.compile(r"[^\[\]{}]++")
 
 
-def load(path: Path) -> Any:
-    """The content of a JSON file; NaN and Infinity are refused.
+def load(path: Path, links: bool = True, nan: bool = False) -> Any:
+    """The content of a JSON file.
+
+    Args:
+      links: whether `path` may be a link, as a file that the user named may be.
+      nan: whether NaN and Infinity, which are not JSON, are accepted.
 
     Raises:
-      FileError: the file is missing, too large or not JSON.
+      FileError: the file is missing, not JSON, or exceeds a budget.
     """
-    text = _text(path)
+    return parse(path, _text(path, links), nan)
+
+
+def load_lines(path: Path, links: bool = True) -> Iterator[tuple[int, Any]]:
+    """Number (from 1) and content of each line of a file of JSON lines; None if it is not JSON."""
+    for number, line in enumerate(_text(path, links).splitlines(), 1):
+        try:
+            yield number, parse(path, line)
+        except FileError:
+            yield number, None
+
+
+def parse(path: Path | str, text: str, nan: bool = False) -> Any:
+    """The value of a JSON text; NaN and Infinity are refused unless `nan`.
+
+    Raises:
+      FileError: it is not JSON, or exceeds a budget; the message begins with `path`.
+    """
+    _check_nesting(path, text)
     try:
-        return _decoder().decode(text)
+        return (json.JSONDecoder() if nan else _decoder()).decode(text)
     except (ValueError, RecursionError) as error:
         raise FileError(path, f"not JSON ({error})") from None
+
+
+def _check_nesting(path: Path | str, text: str, counted: bool = True) -> None:
+    """Raises FileError if a JSON text holds too many lists and objects, or too deep ones."""
+    brackets = _NOT_BRACKETS.sub("", _STRINGS.sub("", text)).encode()
+    if not brackets:
+        return
+    steps = np.frombuffer(brackets, np.uint8) & 2  # of the four, opening ones alone have this bit
+    values, depth = int((steps > 0).sum()), int(np.cumsum(steps.astype(np.int32) - 1).max())
+    for reason in (
+        excess("values", values if counted else 0, f"{values} lists and objects"),
+        excess("depth", depth, f"lists and objects {depth} deep"),
+    ):
+        if reason:
+            raise FileError(path, reason)
 
 
 def members(path: Path) -> Iterator[tuple[str, Any]]:
@@ -35,6 +76,7 @@ def members(path: Path) -> Iterator[tuple[str, Any]]:
       FileError: the file is missing, too large, or not a JSON object.
     """
     text = _text(path)
+    _check_nesting(path, text, counted=False)  # one member after the other is in memory
     decoder = _decoder()
     at = _skip(text, 0)
     if text[at : at + 1] != "{":
@@ -73,15 +115,11 @@ def number(path: Path | str, value: Any, what: str, most: float) -> float:
     return float(value)
 
 
-def _text(path: Path) -> str:
-    if not path.is_file():
-        raise FileError(path, "no such file")
-    if path.stat().st_size > LARGEST:
-        raise FileError(path, f"larger than {LARGEST >> 30} GiB")
+def _text(path: Path, links: bool = True) -> str:
     try:
-        return files.read_text(path)
-    except UnicodeDecodeError as error:
-        raise FileError(path, f"not JSON ({error})") from None
+        return regular.read_text(path, links)
+    except FileNotFoundError:
+        raise FileError(path, "no such file") from None
 
 
 def _decoder() -> json.JSONDecoder:

@@ -22,9 +22,11 @@ from typing import Any
 import numpy as np
 
 from tdanet_jax.io.untrusted import FileError
+from tdanet_jax.io.untrusted.budgets import budgets, excess, unpacking_excess
+from tdanet_jax.io.untrusted.npz import METHODS
 
-#: Numbers in the largest array, and bytes of the largest file that is read.
-LARGEST, LARGEST_FILE = 1 << 24, 1 << 30
+#: Numbers in the largest array.
+LARGEST = 1 << 24
 AGENT_STATE = "ThorAgentState"  # of any module: forks of the reference moved it
 _STORAGES = {
     "FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2", "LongStorage": "<i8",
@@ -78,11 +80,14 @@ class _Machine:
     path: str
     stack: list = field(default_factory=list)
     memo: dict[int, Any] = field(default_factory=dict)
-    storages: list[Storage] = field(default_factory=list)
+    storages: dict[str, Storage] = field(default_factory=dict)
 
     def run(self, stream: io.BytesIO) -> Any:
         """The value of the pickle at the stream's position, which moves past it."""
-        for opcode, argument, _ in pickletools.genops(stream):
+        most = budgets().values
+        for step, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
+            if step >= most:
+                raise FileError(self.path, excess("values", step + 1, f"over {step} steps"))
             if opcode.name == "STOP":
                 return self.stack.pop()
             if opcode.name in _PUSHED:
@@ -165,11 +170,7 @@ class _Machine:
                 dtype = None
         if dtype is None or not 0 <= count <= LARGEST:
             raise FileError(self.path, "a pickle with an unsupported storage")
-        known = [other for other in self.storages if other.key == key]
-        storage = known[0] if known else Storage(dtype, key, count)
-        if not known:
-            self.storages.append(storage)
-        self.stack.append(storage)
+        self.stack.append(self.storages.setdefault(key, Storage(dtype, key, count)))
 
 
 _PUSHED = {
@@ -245,13 +246,12 @@ def load_torch(data: bytes, path: object) -> Any:
         raise FileError(path, "not a file of torch.save")
     value, storages = _run(stream, str(path))
     keys, _ = _run(stream, str(path))
-    if not isinstance(keys, list) or sorted(s.key for s in storages) != _sorted_texts(keys):
+    if not isinstance(keys, list) or sorted(storages) != _sorted_texts(keys):
         raise FileError(path, "not a file of torch.save (its storages do not match)")
-    by_key = {storage.key: storage for storage in storages}
     for key in keys:
-        size = int.from_bytes(stream.read(8), "little")
-        _fill(by_key[key], stream.read(by_key[key].count * np.dtype(by_key[key].dtype).itemsize))
-        if size != by_key[key].count:
+        size, storage = int.from_bytes(stream.read(8), "little"), storages[key]
+        _fill(storage, stream.read(storage.count * np.dtype(storage.dtype).itemsize))
+        if size != storage.count:
             raise FileError(path, "not a file of torch.save (a storage of another size)")
     return value
 
@@ -269,12 +269,15 @@ def _load_zip(data: bytes, path: str) -> Any:
     """torch.save's zip format: <name>/data.pkl, and <name>/data/<key> for each storage."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
-            pickled = [name for name in sizes if name.endswith("/data.pkl")]
-            if len(pickled) != 1 or sum(sizes.values()) > LARGEST_FILE:
+            entries = archive.infolist()
+            unpacked = sum(entry.file_size for entry in entries)
+            if reason := unpacking_excess(len(entries), unpacked, len(data)):
+                raise FileError(path, reason)
+            pickled = [e.filename for e in entries if e.filename.endswith("/data.pkl")]
+            if len(pickled) != 1 or any(e.compress_type not in METHODS for e in entries):
                 raise FileError(path, "not a file of torch.save")
             value, storages = _run(io.BytesIO(archive.read(pickled[0])), path)
-            for storage in storages:
+            for storage in storages.values():
                 _fill(storage, archive.read(f"{pickled[0][:-4]}/{storage.key}"))
     except FileError:
         raise
@@ -283,7 +286,7 @@ def _load_zip(data: bytes, path: str) -> Any:
     return value
 
 
-def _run(stream: io.BytesIO, path: str) -> tuple[Any, list[Storage]]:
+def _run(stream: io.BytesIO, path: str) -> tuple[Any, dict[str, Storage]]:
     machine = _Machine(path)
     try:
         with warnings.catch_warnings(action="ignore"):  # of pickletools, about escapes
@@ -294,17 +297,20 @@ def _run(stream: io.BytesIO, path: str) -> tuple[Any, list[Storage]]:
         raise FileError(path, f"not a pickle ({error or type(error).__name__})") from None
 
 
-def array(value: Any, path: object) -> np.ndarray:
+def array(value: Any, path: object, most: int = LARGEST) -> np.ndarray:
     """The numbers of a pickled NumPy array or torch tensor.
+
+    Args:
+      most: numbers that it may have.
 
     Raises:
       FileError: it is neither, not numeric, or too large.
     """
     try:
         if isinstance(value, Call) and value.name in _ARRAY:
-            return _numpy_array(value)
+            return _numpy_array(value, most)
         if isinstance(value, Call) and value.name in _TENSOR:
-            return _tensor(value, path)
+            return _tensor(value, path, most)
     except FileError:
         raise
     except Exception as error:  # whatever does not have the expected form
@@ -312,14 +318,16 @@ def array(value: Any, path: object) -> np.ndarray:
     raise FileError(path, "something other than an array")
 
 
-def _numpy_array(value: Call) -> np.ndarray:
+def _numpy_array(value: Call, most: int) -> np.ndarray:
     _, shape, dtype, by_column, data = value.state
-    code = dtype.arguments[0]
-    order = dtype.state[1]
+    code: Any = dtype.arguments[0]
+    order: Any = dtype.state[1]
+    if not isinstance(code, str):  # hashing a tuple of tuples may take for ever
+        raise ValueError("not numeric")
     if dtype.name != _DTYPE or code not in _NUMBERS or order not in ("<", ">", "|", "="):
         raise ValueError("not numeric")
-    numbers = np.frombuffer(_octets(data), np.dtype(code).newbyteorder(order))
-    if len(numbers) > LARGEST:
+    numbers = np.frombuffer(_octets(data, most), np.dtype(code).newbyteorder(order))
+    if len(numbers) > most:
         raise ValueError("too large")
     return numbers.reshape(_sizes(shape), order="F" if by_column else "C")
 
@@ -328,35 +336,44 @@ _NUMBERS = {f"{kind}{size}" for kind, sizes in (("f", "248"), ("iu", "1248")) fo
             for size in sizes}  # fmt: skip
 
 
-def _octets(data: Any) -> bytes:
-    """Bytes; pickles of protocol 2 write them as text in latin-1 and a call that encodes it."""
+def _octets(data: Any, most: int) -> bytes:
+    """The bytes of up to `most` numbers, and of the pickles around them; pickles of protocol 2
+    write bytes as text in latin-1 and a call that encodes it."""
     if isinstance(data, Call) and data.name == _BYTES and data.arguments[1:] == ("latin1",):
-        return data.arguments[0].encode("latin-1")
-    if not isinstance(data, bytes):
+        data = data.arguments[0]
+    if not isinstance(data, bytes | str):
         raise ValueError("not bytes")
-    return data
+    if len(data) > 16 * most + 4096:  # before anything is copied
+        raise ValueError("too large")
+    return data.encode("latin-1") if isinstance(data, str) else data
 
 
-def _tensor(value: Call, path: object) -> np.ndarray:
+def _tensor(value: Call, path: object, most: int) -> np.ndarray:
     storage, first, shape, strides = value.arguments[:4]
     if isinstance(storage, Call) and storage.name == _NESTED:
-        storage = load_torch(_octets(storage.arguments[0]), path)
+        storage = load_torch(_octets(storage.arguments[0], most), path)
     elif isinstance(storage, Call) and storage.name.rpartition(".")[2] in _STORAGES:
-        kind = _STORAGES[storage.name.rpartition(".")[2]]
-        storage = Storage(kind, "", 0, np.array(storage.arguments[0], kind))
+        kind, numbers = _STORAGES[storage.name.rpartition(".")[2]], storage.arguments[0]
+        if len(numbers) > most or not all(
+            type(number) in (int, float) for number in numbers
+        ):  # lists in lists multiply
+            raise ValueError("not numeric")
+        storage = Storage(kind, "", 0, np.array(numbers, kind))
     if not isinstance(storage, Storage) or storage.values is None:
         raise ValueError("a tensor without data")
     sizes, steps = _sizes(shape), _sizes(strides)
-    if len(sizes) != len(steps) or math.prod(sizes) > LARGEST:
+    held = storage.values
+    if len(sizes) != len(steps) or math.prod(sizes) > min(
+        len(held), most
+    ):  # a step of 0 repeats numbers
         raise ValueError("a tensor with an invalid shape")
-    place = np.full(sizes, int(first), np.int64)
-    for axis, (size, step) in enumerate(zip(sizes, steps, strict=True)):
-        along = [1] * len(sizes)
-        along[axis] = size
-        place = place + (np.arange(size) * step).reshape(along)
-    if place.size and not 0 <= place.min() <= place.max() < len(storage.values):
+    if math.prod(sizes) == 0:
+        return np.zeros(sizes, held.dtype)
+    last = first + sum((size - 1) * step for size, step in zip(sizes, steps, strict=True))
+    if type(first) is not int or not 0 <= first <= last < len(held):
         raise ValueError("a tensor beyond its storage")
-    return storage.values[place]
+    strides = [step * held.itemsize for step in steps]
+    return np.lib.stride_tricks.as_strided(held[first:], sizes, strides, writeable=False).copy()
 
 
 def _sizes(values: Any) -> tuple[int, ...]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -54,9 +52,9 @@ def write_folder(
     if vectors is not None or features:
         hdf5.need_h5py(out)
     connected = largest_parts(tables)
-    temporary = files.partial_path(out)
-    try:
-        temporary.mkdir(parents=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with files.replacing(out) as temporary:
+        temporary.mkdir()
         for i, name in enumerate(tables.scenes):
             room = connected.tables.subset([name])
             folder = temporary / name
@@ -72,10 +70,7 @@ def write_folder(
             _write(temporary / layout.PARENT_FILE, titled)
         if vectors is not None:
             write_vectors(tables.classes, vectors, temporary / "thor_glove")
-        os.replace(temporary, out)
-        return connected
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    return connected
 
 
 def check_layout(tables: SceneTables) -> None:

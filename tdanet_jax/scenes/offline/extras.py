@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tdanet_jax.io.untrusted import FileError, jsons, pickles
+from tdanet_jax.io.escaping import in_name
+from tdanet_jax.io.untrusted import FileError, jsons, pickles, regular
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
 from tdanet_jax.scenes.offline.layout import (
     PARENT_FILE,
@@ -24,6 +25,7 @@ from tdanet_jax.vocabulary import ROOM_TYPES
 
 MOST_EPISODES, MOST_CLASSES = 100_000, 2_000
 LARGEST_REWARD = 100.0
+WIDEST = 4096  # numbers in an episode's word vector
 #: Number of episodes to name, of those that are left out for one reason.
 NAMED = 3
 #: Lists of episodes are called <room>_test.pkl and <room>_val.pkl.
@@ -116,15 +118,16 @@ def read_graph(names_path: Path, matrix_path: Path) -> tuple[tuple[str, ...], np
     Raises:
       FileError: a file is missing or broken, or they do not match.
     """
-    for path in (names_path, matrix_path):
-        if not path.is_file() or path.stat().st_size > pickles.LARGEST_FILE:
-            raise FileError(path, "no such file, or too large")
-    text = names_path.read_text(encoding="utf-8-sig", errors="replace")
+    try:
+        text = regular.read_bytes(names_path).decode("utf-8-sig", errors="replace")
+        content = regular.read_bytes(matrix_path)
+    except FileNotFoundError as error:
+        raise FileError(error.filename, "no such file") from None
     names = tuple(line.strip() for line in text.splitlines() if line.strip())
     if not 0 < len(names) <= MOST_CLASSES or len(set(names)) != len(names):
         raise FileError(names_path, "not a list of distinct class names")
-    value = pickles.load_torch(matrix_path.read_bytes(), matrix_path)
-    matrix = pickles.array(value, matrix_path)
+    value = pickles.load_torch(content, matrix_path)
+    matrix = pickles.array(value, matrix_path, MOST_CLASSES**2)
     if matrix.shape != (len(names), len(names)):
         raise FileError(matrix_path, f"shape {matrix.shape} is not that of {len(names)} classes")
     plain = matrix.astype(np.float32)
@@ -142,9 +145,9 @@ def read_episodes(
       FileError: it is not a list of episodes.
     """
     part = path.stem.rpartition("_")[2]
-    if part not in PARTS or path.stat().st_size > pickles.LARGEST_FILE:
-        raise FileError(path, "not named <room>_test.pkl or <room>_val.pkl, or too large")
-    records = pickles.load(path.read_bytes(), path)
+    if part not in PARTS:
+        raise FileError(path, "not named <room>_test.pkl or <room>_val.pkl")
+    records = pickles.load(regular.read_bytes(path), path)
     if not isinstance(records, list) or len(records) > MOST_EPISODES:
         raise FileError(path, "not a list of episodes")
     found: list[PublishedEpisode] = []
@@ -153,7 +156,7 @@ def read_episodes(
         if reason := _misfit(episode, rooms.get(episode.scene)):
             key = state_key(episode.x, episode.z, episode.rotation, episode.horizon)
             name = f"episode {i} of {path.name} ({episode.scene:.40} {key} {episode.target:.40})"
-            others[reason].append("".join(c if c.isprintable() else "?" for c in name))
+            others[reason].append(in_name(name))
         else:
             found.append(episode)
     return found, others
@@ -183,7 +186,7 @@ def _episodes(path: Path, records: list[Any], part: str) -> Iterator[PublishedEp
         if not isinstance(scene, str) or not isinstance(target, str):
             raise FileError(path, f"{where}: scene or goal_object_type is not text")
         if "glove_embedding" in record:  # only checked: word vectors come from --word-vectors
-            pickles.array(record["glove_embedding"], path)
+            pickles.array(record["glove_embedding"], path, WIDEST)
         state = record["state"]
         fields = state.state if isinstance(state, pickles.Call) else None
         if not isinstance(fields, dict) or not state.name.endswith(pickles.AGENT_STATE):

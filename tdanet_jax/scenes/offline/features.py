@@ -105,7 +105,7 @@ def load_features(data: Path, tables: SceneTables) -> np.ndarray:
     if not path.is_file():
         raise FileError(path, "no such file; import with --features")
     try:
-        features = np.load(path, mmap_mode="r", allow_pickle=False)
+        features = np.lib.format.open_memmap(path, mode="r")
     except (ValueError, OSError) as error:
         raise FileError(path, f"not an array ({error})") from None
     if features.shape != (tables.num_states, *layout.FEATURE_SHAPE) or features.dtype != np.float16:

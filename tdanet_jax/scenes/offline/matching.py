@@ -15,10 +15,9 @@ import numpy as np
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes.offline.layout import OBJECT_FILE
 from tdanet_jax.scenes.offline.object_ids import UNKNOWN, class_of, is_id, place_in
-from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.scenes.scene import MOST_OBJECTS, Scene, SceneObject
 from tdanet_jax.scenes.visibility.build import Detections
 
-MOST_OBJECTS = 20_000
 #: The box in the image of an object that is visible, but has none in the data.
 NO_BOX = (-1, -1, -1, -1)
 
@@ -40,6 +39,8 @@ class Objects:
         """
         if not name or not object_class or len(self.classes) >= MOST_OBJECTS:
             raise FileError(path, "an object without a name, or too many objects")
+        if not name.isprintable() or not object_class.isprintable():
+            raise FileError(path, f"object {name[:40]}: has a control character")
         self.classes[name] = object_class
         self.boxes[name] = box
 

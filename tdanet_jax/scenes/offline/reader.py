@@ -17,16 +17,15 @@ from tdanet_jax.scenes.metadata import FARTHEST, check_points
 from tdanet_jax.scenes.offline import frames, layout
 from tdanet_jax.scenes.offline.frames import Frame
 from tdanet_jax.scenes.offline.layout import Grid
-from tdanet_jax.scenes.offline.matching import MOST_OBJECTS, BoxMatcher, Objects
+from tdanet_jax.scenes.offline.matching import BoxMatcher, Objects
 from tdanet_jax.scenes.offline.object_ids import UNKNOWN, class_of, is_id, place_in
-from tdanet_jax.scenes.scene import SUBPIXEL, Scene, SceneError
+from tdanet_jax.scenes.scene import MOST_OBJECTS, MOST_POINTS, SUBPIXEL, Scene, SceneError
 from tdanet_jax.scenes.visibility.build import Detections
 from tdanet_jax.scenes.visibility.geometry import transitions
 from tdanet_jax.vocabulary import IMAGE_SIZE
 
 #: Pixels by which a box may leave the frame, to which it is then clipped.
 OVERHANG = 1.0
-MOST_POINTS = 20_000
 _CLASS = re.compile(r"[A-Za-z][A-Za-z0-9]*")
 
 

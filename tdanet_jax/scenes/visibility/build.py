@@ -9,19 +9,19 @@ defines to the last bit, so that tables are equal on every machine.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
+from tdanet_jax.io.untrusted.budgets import excess
 from tdanet_jax.poses import PoseGrid
-from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene
+from tdanet_jax.scenes.scene import CAMERA_ABOVE_AGENT, SUBPIXEL, Scene, SceneError
 from tdanet_jax.scenes.visibility import rays
 from tdanet_jax.scenes.visibility.geometry import gap_to_box
 from tdanet_jax.scenes.visibility.rules import Rules
-from tdanet_jax.scenes.visibility.solids import Patches, millimetres, patches_of, solids_of
+from tdanet_jax.scenes.visibility.solids import PAIRS, Patches, millimetres, patches_of, solids_of
 from tdanet_jax.vocabulary import IMAGE_SIZE
-
-PAIRS = 1 << 21  # of a camera and a patch, in a batch
 
 
 def cosine_and_sine(degrees: int) -> tuple[np.float32, np.float32]:
@@ -98,13 +98,27 @@ def within_reach(scene: Scene, points: np.ndarray, patches: Patches, rules: Rule
     return result
 
 
-def detect(scene: Scene, rules: Rules, points: np.ndarray | None = None) -> Detections:
+def detect(
+    scene: Scene,
+    rules: Rules,
+    points: np.ndarray | None = None,
+    report: Callable[[float], None] | None = None,
+) -> Detections:
     """The detections at `points` [P, 3] (by default the reachable ones) in all views.
 
     Memory is bounded: many points in a room of many patches are worked on in several batches.
+
+    Args:
+      report: called with the share of the points that is done.
+
+    Raises:
+      SceneError: the room has more patches, or lines of sight and boxes, than the budget allows.
     """
     points = scene.points if points is None else points
     patches, solids = patches_of(scene, rules), solids_of(scene, rules)
+    tests = len(points) * len(patches.owner) * len(solids.lo)
+    if reason := excess("tests", tests, f"{tests} pairs of a line of sight and a box"):
+        raise SceneError(f"{scene.name}: {reason}")
     batch = max(1, PAIRS // max(len(patches.owner), 1))
     parts = []
     for first in range(0, len(points), batch):
@@ -112,6 +126,8 @@ def detect(scene: Scene, rules: Rules, points: np.ndarray | None = None) -> Dete
         near = within_reach(scene, here, patches, rules)
         found = _detect(scene.grid, here, near, patches, solids, rules)
         parts.append(found._replace(state=found.state + np.int32(first * scene.grid.views)))
+        if report is not None:
+            report(min(first + batch, len(points)) / len(points))
     return Detections(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -160,10 +176,10 @@ def _boxes_in_view(
     x, up, z = (center[patch, axis] - eye[position, axis] for axis in range(3))
     radius = np.abs(corner - center[:, None]).sum(axis=-1).max(initial=0) + 1
     # Of the four corners of each patch: the two where a run begins [Q, 2], and where it ends.
-    corners = turned(
-        *(np.stack([corner[:, ::2, a], corner[:, 1::2, a]]) for a in (0, 2)), grid.turn
+    corners_x, corners_up, corners_z = (
+        np.stack([corner[:, ::2, axis], corner[:, 1::2, axis]]) for axis in range(3)
     )
-    corners_up = np.stack([corner[:, ::2, 1], corner[:, 1::2, 1]])
+    corners = turned(corners_x, corners_z, grid.turn)
     eyes, eyes_up = turned(eye[:, 0], eye[:, 2], grid.turn), np.ascontiguousarray(eye[:, 1])
     none = np.zeros(0, np.int32)
     parts = [(none, none, np.zeros((0, 4), np.int16), np.zeros(0, bool))]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from tdanet_jax.poses import ITHOR, STEPS, PoseGrid
-from tdanet_jax.scenes.scene import SceneObject
+from tdanet_jax.scenes.scene import SceneError, SceneObject
 
 THIN = 1e-3  # metres; a box that is thinner than this is taken to be this thick
 
@@ -100,6 +100,8 @@ def action_distances(successor: np.ndarray, goals: np.ndarray) -> np.ndarray:
     frontier, step = seen, 0
     while frontier.any():
         step += 1
+        if step > np.iinfo(np.int16).max:
+            raise SceneError(f"a way of more than {step - 1} actions")
         arriving = np.bitwise_or.reduce(frontier[successor], axis=1) & ~seen
         state = np.flatnonzero(arriving)
         hit = (arriving[state, None] & bits) != 0

@@ -7,12 +7,14 @@ from functools import cache
 
 import numpy as np
 
-from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.io.untrusted.budgets import excess
+from tdanet_jax.scenes.scene import Scene, SceneError, SceneObject
 from tdanet_jax.scenes.visibility.geometry import THIN, box_frame
 from tdanet_jax.scenes.visibility.rays import CLOSED, FARTHEST, OPEN, TURN_BITS, Solids
 from tdanet_jax.scenes.visibility.rules import Rules
 
 MOST_PATCHES = 64  # along an edge
+PAIRS = 1 << 21  # of a camera and a patch, in a batch
 FACES = [(axis, side) for axis in range(3) for side in (0, 1)]  # of a box: lower and upper sides
 BOTTOM = (1, 0)
 CELL = 0.25  # metres, cell of the floor plan in which voids are found
@@ -56,9 +58,13 @@ def fronts_of(item: SceneObject, points: np.ndarray, nearly: float) -> list[tupl
 
 
 def patches_of(scene: Scene, rules: Rules) -> Patches:
-    """Divides the faces of every object that can be seen into patches."""
+    """Divides the faces of every object that can be seen into patches.
+
+    Raises:
+      SceneError: there are more than the budget allows.
+    """
     parts = []
-    first = 0
+    total = first = 0
     for index, item in enumerate(scene.objects):
         origin, edges = box_frame(item.box, item.corners)
         lengths = np.sqrt((edges * edges).sum(axis=1))
@@ -70,6 +76,9 @@ def patches_of(scene: Scene, rules: Rules) -> Patches:
         if item.object_class in rules.knobs:
             behind = {(axis, 1 - side) for axis, side in fronts}
             faces = [face for face in FACES if face in fronts or face not in {BOTTOM, *behind}]
+        total += sum(int(counts[axis - 1] * counts[axis - 2]) for axis, _ in faces)
+        if reason := excess("patches", total, f"{total} patches up to object {item.object_id}"):
+            raise SceneError(f"{scene.name}: {reason}")
         for axis, side in faces:
             u, v = (axis + 1) % 3, (axis + 2) % 3
             grid = _unit_grid(counts[u], counts[v])
@@ -98,8 +107,12 @@ def patches_of(scene: Scene, rules: Rules) -> Patches:
 
 def near_any(places: np.ndarray, points: np.ndarray, radius: float) -> np.ndarray:
     """Whether each of `places` [N, 3] is within `radius` of any of `points`, horizontally."""
-    offset = (places[:, None] - points)[:, :, [0, 2]]
-    return ((offset * offset).sum(axis=-1) < radius**2).any(axis=1)
+    near = np.zeros(len(places), bool)
+    batch = max(1, PAIRS // len(points))
+    for first in range(0, len(places), batch):
+        offset = (places[first : first + batch, None] - points)[:, :, [0, 2]]
+        near[first : first + batch] = ((offset * offset).sum(axis=-1) < radius**2).any(axis=1)
+    return near
 
 
 @cache

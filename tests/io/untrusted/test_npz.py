@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -61,3 +63,49 @@ def test_objects_sizes_and_damage(tmp_path: Path) -> None:
             npz.read(path)
     with pytest.raises(FileError, match="no such file"):
         npz.read(tmp_path / "b.npz")
+
+
+def test_sizes_are_added_up_before_anything_is_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    zeros = npy(np.zeros(16 << 20, np.int8))
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in range(5):
+            archive.writestr(f"{name}.npy", zeros)
+    tracemalloc.start()
+    with pytest.raises(FileError, match=r"unpacks to 1.* times its size, more than 200"):
+        npz.read(path)
+    assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    tracemalloc.stop()
+
+
+def test_an_array_is_read_once_and_not_copied(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, a=np.ones(32 << 20, np.int8))
+    tracemalloc.start()
+    assert npz.read(path)["a"].all()
+    assert tracemalloc.get_traced_memory()[1] < 40 << 20
+    tracemalloc.stop()
+
+
+def test_too_many_arrays_and_other_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TDANET_BUDGETS", "arrays=2")
+    path = packed(tmp_path / "a.npz", **{f"{i}.npy": npy(np.zeros(3)) for i in range(3)})
+    with pytest.raises(FileError, match=r"3 arrays, more than 2; .* TDANET_BUDGETS=arrays=3"):
+        npz.read(path)
+    for method in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):  # they expand a million-fold
+        with zipfile.ZipFile(path, "w", method) as archive:
+            archive.writestr("a.npy", npy(np.zeros(3)))
+        with pytest.raises(FileError, match="unsupported method"):
+            npz.read(path)
+
+
+def test_pipes_and_links(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.npz")
+    np.savez(tmp_path / "whole.npz", a=np.zeros(3))
+    (tmp_path / "link.npz").symlink_to("whole.npz")
+    for place in (tmp_path / "pipe.npz", Path("/dev/zero"), tmp_path):
+        with pytest.raises(FileError, match="not a regular file"):
+            npz.read(place)
+    assert npz.read(tmp_path / "link.npz").keys() == {"a"}
+    with pytest.raises(FileError, match="a link, which is not followed"):
+        npz.read(tmp_path / "link.npz", links=False)

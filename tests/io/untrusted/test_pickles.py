@@ -168,3 +168,46 @@ def test_states_are_those_of_the_agent() -> None:
     [record] = pickles.load(data, "f")
     assert record["state"].state["rotation"] == 90
     np.testing.assert_array_equal(pickles.array(record["glove_embedding"], "f"), [2, 3, 4, 5])
+
+
+def twice_itself(times: int) -> list:
+    value: list = [0.5]
+    for _ in range(times):
+        value = [value, value]
+    return value
+
+
+def test_what_is_shared_is_not_multiplied() -> None:
+    """A list that holds another twice, which does so too, has 2^60 numbers in 200 bytes."""
+    many, pairs = twice_itself(60), ()
+    for _ in range(60):
+        pairs = (pairs, pairs)
+    reconstruct = np.zeros(1).__reduce__()[0]
+    array = pickles.Call(
+        f"{reconstruct.__module__}.{reconstruct.__name__}", (),
+        (1, (1,), pickles.Call("numpy.dtype", (pairs,), (3, "<")), False, b"1234"),
+    )  # fmt: skip
+    tensor = pickles.Call(
+        "torch._utils._rebuild_tensor_v2",
+        (pickles.Call("torch.FloatStorage", (many,)), 0, (1,), (1,)),
+    )
+    for value in (array, tensor):
+        with pytest.raises(FileError, match="f: a broken array"):
+            pickles.array(value, "f")
+
+
+def test_a_tensor_has_at_most_the_numbers_of_its_storage() -> None:
+    with fake_torch():
+        data = pickle.dumps(Tensor(np.arange(9), 0, (2**12, 2**12), (0, 0)))
+    with pytest.raises(FileError, match="f: a broken array"):
+        pickles.array(pickles.load(data, "f"), "f")
+
+
+def test_numbers_and_steps_have_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
+    numbers = pickles.load(pickle.dumps(np.arange(9.0), 2), "f")
+    assert len(pickles.array(numbers, "f", 9)) == 9
+    with pytest.raises(FileError, match="f: a broken array"):
+        pickles.array(numbers, "f", 8)
+    monkeypatch.setenv("TDANET_BUDGETS", "values=100")
+    with pytest.raises(FileError, match="f: over 100 steps, more than 100"):
+        pickles.load(pickle.dumps([[]] * 200), "f")
