@@ -204,24 +204,24 @@ def _bundled_labels() -> Labels:
     return Labels()
 
 
-def build_asset(out_dir: Path) -> Path:
+def build_asset(out_dir: Path | str) -> Path:
     """Copies the bundled table, which is written by hand: its checksum is not verified."""
-    return Path(shutil.copy(assets.folder() / ASSET, out_dir / ASSET))
+    return Path(shutil.copy(assets.folder() / ASSET, Path(out_dir) / ASSET))
 
 
-def names_in(path: Path) -> list[str]:
+def names_in(path: Path | str) -> list[str]:
     """All names in a table, which `words.build_asset` keeps the vectors of."""
     return [name for head, others in read(path).items() for name in (head, *others)]
 
 
-def read(path: Path) -> Synonyms:
+def read(path: Path | str) -> Synonyms:
     """The table in a JSON file.
 
     Raises:
       FileError: the file is missing, or holds no table; the message names the entry.
     """
     table: dict[str, Iterable[str]] = {}
-    for name, others in jsons.members(path):
+    for name, others in jsons.members(Path(path)):
         if name in table:
             raise FileError(path, f"{name}: is listed twice")
         table[name] = others

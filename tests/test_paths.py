@@ -143,10 +143,10 @@ def test_a_path_as_text(place: Path, some_rooms: SceneTables, use: str) -> None:
         (tdanet_jax.load, "rooms.csv", "rooms.csv/config.json: Not a directory; is this the fo"),
         (tdanet_jax.evaluate, "rooms.csv", "rooms.csv/config.json: Not a directory; is this the"),
         (tdanet_jax.load, "nowhere", "nowhere/config.json: no such file; is this the folder"),
-        (configs.load, "run", "run: Is a directory"),
-        (classes.load_vocabulary, "rooms.csv", "rooms.csv/classes.json: Not a directory"),
-        (metadata.read_scenes, "run", "run: Is a directory"),
-        (dataset.load, "run", "run: no such file"),
+        (configs.load, "run", "run: not a regular file"),
+        (classes.load_vocabulary, "rooms.csv", "rooms.csv: not the folder of a run"),
+        (metadata.read_scenes, "run", "run: not a regular file"),
+        (dataset.load, "run", "run: not a regular file"),
     ],
 )
 def test_a_path_of_another_kind_is_a_value_error(

@@ -57,16 +57,6 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def read_text(path: Path) -> str:
-    """The text of a file in UTF-8, with or without a byte-order mark.
-
-    Raises:
-      OSError: it cannot be read.
-      UnicodeDecodeError: it is not UTF-8.
-    """
-    return path.read_text(encoding="utf-8-sig")
-
-
 def remove_partial(folder: Path) -> list[Path]:
     """Removes unfinished files from `folder`; no other process may be writing to it."""
     found = sorted(folder.glob(f"{PARTIAL}*"))

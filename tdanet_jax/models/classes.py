@@ -93,6 +93,8 @@ def load_vocabulary(run: Path | str) -> ClassVocabulary:
     """
     run = Path(run)
     path = run / CLASSES_FILE
+    if run.is_file():
+        raise FileError(run, "not the folder of a run")
     if not os.path.lexists(path):
         return ClassVocabulary()
     values = jsons.load(path, links=False)

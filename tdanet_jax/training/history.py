@@ -113,7 +113,7 @@ def read(path: Path | str) -> Snapshot:
     return snapshot(path, nested(path, renamed(content, written)), **progress)
 
 
-def nested(path: Path, arrays: Mapping[str, Any]) -> Any:
+def nested(path: Path | str, arrays: Mapping[str, Any]) -> Any:
     """Nested dictionaries of arrays whose names are paths.
 
     Raises:
@@ -126,7 +126,7 @@ def nested(path: Path, arrays: Mapping[str, Any]) -> Any:
     return traverse_util.unflatten_dict(arrays, sep="/")
 
 
-def snapshot(path: Path, weights: Any, **progress: Any) -> Snapshot:
+def snapshot(path: Path | str, weights: Any, **progress: Any) -> Snapshot:
     """A network that was read from a file, with the progress of its run.
 
     Raises:
@@ -143,7 +143,7 @@ def snapshot(path: Path, weights: Any, **progress: Any) -> Snapshot:
     return Snapshot(weights=weights, **progress)
 
 
-def check_fit(path: Path, weights: Any, expected: Any) -> None:
+def check_fit(path: Path | str, weights: Any, expected: Any) -> None:
     """Checks that a network has the parameters of the model that its configuration describes.
 
     Args:

@@ -202,7 +202,7 @@ def test_names_from_files_are_printed_as_they_are(capsys: pytest.CaptureFixture[
 
 def test_a_bar_shows_names_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     written = io.StringIO()
-    terminal = console._PlainConsole(
+    terminal = console.PlainConsole(
         file=written, force_terminal=True, highlight=False, markup=False, width=120
     )
     monkeypatch.setattr(console, "console", terminal)
