@@ -38,7 +38,7 @@ class Broken(io.StringIO):
 @pytest.fixture(autouse=True)
 def own_console(monkeypatch: pytest.MonkeyPatch) -> None:
     """A console that keeps nothing of what could not be written."""
-    monkeypatch.setattr(console, "console", console.OurConsole(soft_wrap=True))
+    monkeypatch.setattr(console, "console", console.PlainConsole(soft_wrap=True))
 
 
 @pytest.fixture

@@ -304,7 +304,7 @@ FAULTS = (
     Fault("an old name is not known any more", "training/renames.py", 'r"^held$"', 'r"^helm$"',
           "training/test_old_runs.py"),
     Fault("an agent that was passed on is trained over", "training/checkpoint.py",
-          "return os.path.lexists(run / history.NETWORK)", "return False", "evaluation/test_saved_networks.py"),
+          "return os.path.lexists(Path(run) / history.NETWORK)", "return False", "evaluation/test_saved_networks.py"),
     Fault("a stranger's model is imported", "config.py", '{"model": (config.model,), ', "{",
           "test_config.py"),
     Fault("a stranger's sensor is imported", "config.py", ', "sensor": config.network.sensors}', "}",

@@ -250,5 +250,6 @@ def test_a_checkpoint_of_other_tables_is_refused(whole, task, ithor):
 
 
 def test_a_last_line_that_was_cut_short_is_left_out(tmp_path):
-    (tmp_path / "metrics.jsonl").write_text(json.dumps({"updates": 1}) + '\n{"upda')
-    assert read_metrics(tmp_path) == [{"updates": 1}]
+    row = {"updates": 1, "steps": 40, "episodes": 3}
+    (tmp_path / "metrics.jsonl").write_text(json.dumps(row) + '\n{"upda')
+    assert read_metrics(tmp_path) == [row]

@@ -34,7 +34,7 @@ def load(path: Path, links: bool = True, nan: bool = False) -> Any:
 
 def load_lines(path: Path, links: bool = True) -> Iterator[tuple[int, Any]]:
     """Number (from 1) and content of each line of a file of JSON lines; None if it is not JSON."""
-    for number, line in enumerate(_text(path, links).splitlines(), 1):
+    for number, line in enumerate(_text(path, links, "replace").splitlines(), 1):
         try:
             yield number, parse(path, line)
         except FileError:
@@ -115,9 +115,9 @@ def number(path: Path | str, value: Any, what: str, most: float) -> float:
     return float(value)
 
 
-def _text(path: Path, links: bool = True) -> str:
+def _text(path: Path, links: bool = True, errors: str = "strict") -> str:
     try:
-        return regular.read_text(path, links)
+        return regular.read_text(path, links, errors)
     except FileNotFoundError:
         raise FileError(path, "no such file") from None
 

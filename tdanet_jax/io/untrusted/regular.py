@@ -47,10 +47,14 @@ def read_bytes(path: Path, links: bool = True) -> bytes:
         return file.read(size)
 
 
-def read_text(path: Path, links: bool = True) -> str:
-    """The text of a regular file in UTF-8, with or without a byte-order mark; as `read_bytes`."""
+def read_text(path: Path, links: bool = True, errors: str = "strict") -> str:
+    """The text of a regular file in UTF-8, with or without a byte-order mark; as `read_bytes`.
+
+    Args:
+      errors: "replace", if bytes that are not UTF-8 are no error, as for `bytes.decode`.
+    """
     try:
-        return read_bytes(path, links).decode("utf-8-sig")
+        return read_bytes(path, links).decode("utf-8-sig", errors)
     except UnicodeDecodeError as error:
         raise FileError(path, f"not UTF-8 ({error})") from None
 
