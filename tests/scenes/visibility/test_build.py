@@ -392,3 +392,16 @@ def test_batches_of_positions_change_nothing(monkeypatch: pytest.MonkeyPatch) ->
     for field, other in zip(whole, detect(scene, RULES), strict=True):
         assert field.dtype == other.dtype
         assert np.array_equal(field, other)
+
+
+def test_the_middle_of_a_run_of_patches_adds_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In FloorPlan412 a shower's glass reaches behind the camera, where this does not hold."""
+    scene = next(room for room in ithor.load_scenes() if room.name == "FloorPlan412")
+    expected = detect(scene, RULES)
+
+    def each_alone(place: np.ndarray, alone: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.arange(len(place)), np.arange(len(place))
+
+    monkeypatch.setattr(build, "_runs", each_alone)
+    for found, right in zip(detect(scene, RULES), expected, strict=True):
+        np.testing.assert_array_equal(found, right)
