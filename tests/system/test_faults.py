@@ -334,8 +334,8 @@ def test_tensorboard_gets_every_figure(tmp_path: Path) -> None:
     sink(row(2))
     found = events(tmp_path / "tensorboard")
     assert found == [
-        (40, "train/updates", 1.0), (40, "train/success", 0.5), (80, "train/updates", 2.0),
-        (80, "train/success", 0.5),
+        (40, "train/updates", 1.0), (40, "train/episodes", 1.0), (40, "train/success", 0.5),
+        (80, "train/updates", 2.0), (80, "train/episodes", 2.0), (80, "train/success", 0.5),
     ]  # fmt: skip
 
 
