@@ -17,7 +17,7 @@ BROKEN_PIPE = 128 + signal.SIGPIPE
 
 @contextlib.contextmanager
 def ends_with_its_reader() -> Iterator[None]:
-    """Inside, a reader that ends, such as `head`, ends the command: without a word, status 141."""
+    """Ends the command silently, with status 141, once the reader of its output exits (`| head`)."""
     try:
         try:
             yield
@@ -35,10 +35,10 @@ def ends_with_its_reader() -> Iterator[None]:
 
 @contextlib.contextmanager
 def output_may_break() -> Iterator[None]:
-    """Inside, work goes on, with a note, when its output cannot be written any more.
+    """Lets the body continue, after one warning, once its output can no longer be written.
 
-    That is when the reader of a pipe has ended, or the terminal was closed, whose signal (SIGHUP)
-    is ignored.
+    This happens when the reader of a pipe exits or the terminal is closed; the terminal's signal,
+    SIGHUP, is ignored.
     """
     before = sys.stdout, sys.stderr
     hang_up: Any = None

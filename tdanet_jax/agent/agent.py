@@ -25,7 +25,7 @@ from tdanet_jax.labels import LabelError, Labels, Synonyms
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
 from tdanet_jax.models.classes import ClassVocabulary, load_vocabulary
-from tdanet_jax.models.factory import check_width, make_model
+from tdanet_jax.models.factory import make_model
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.sensors import suite
 from tdanet_jax.sensors.detections import centre_and_area, merge_classes
@@ -318,9 +318,8 @@ def load(
     vectors = words.load_word_vectors(path, classes.names)
     agent = Agent(config, weights, vectors, classes, grid, synonyms)
     shape = max(len(classes.names), 1), vectors.vectors.shape[1]
-    if path is not None:
-        check_width(run, agent.model, weights, shape)
-    history.check_fit(Path(run), weights, agent.model.parameter_shapes(*shape))
+    expected, width = agent.model.parameter_shapes(*shape), None if path is None else shape[1]
+    history.check_fit(run, weights, expected, width)
     return agent
 
 

@@ -27,7 +27,6 @@ from tdanet_jax.evaluation.policies import Policy
 from tdanet_jax.evaluation.rollout import Records
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
-from tdanet_jax.models.factory import check_width
 from tdanet_jax.scenes import camera_view
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.tables import SceneTables
@@ -96,9 +95,8 @@ def load_player(
     path = find_word_vectors(config, agent.folder_of(run), word_vectors)
     task = task_in(rooms, dataclasses.replace(config, word_vectors=path))
     task.check_known(run, classes.names)
-    if path is not None:
-        check_width(run, task.model, weights, task.words.shape)
-    history.check_fit(Path(run), weights, task.model.parameter_shapes(*task.words.shape))
+    expected = task.model.parameter_shapes(*task.words.shape)
+    history.check_fit(run, weights, expected, None if path is None else task.words.shape[1])
     return Player(Path(run).resolve().name, task, task.model, weights, greedy)
 
 

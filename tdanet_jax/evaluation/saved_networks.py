@@ -23,7 +23,6 @@ from tdanet_jax.evaluation.report import Played
 from tdanet_jax.io import assets, files
 from tdanet_jax.io.untrusted import regular
 from tdanet_jax.models import classes
-from tdanet_jax.models.factory import check_width
 from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
 from tdanet_jax.task import Task, load_task
 from tdanet_jax.training import history
@@ -166,12 +165,14 @@ def evaluate(
         params, lists = selection.select(task, members[0].test)
         policy = policies.network(task.model, task.words, greedy)
         expected = task.model.parameter_shapes(*task.words.shape)
+        width = None if members[0].located.word_vectors is None else task.words.shape[1]
         together = 1 if jax.default_backend() == "cpu" else TOGETHER
         for start in range(0, len(members), together):
             part = members[start : start + together]
             snapshots = [_checked(network, task) for network in part]
             for network, snapshot in zip(part, snapshots, strict=True):
-                history.check_fit(network.point or network.run, snapshot.weights, expected)
+                of = network.point or network.run
+                history.check_fit(of, snapshot.weights, expected, width)
             weights = jax.tree.map(
                 lambda *leaves: jnp.stack(leaves), *(s.weights for s in snapshots)
             )
@@ -218,6 +219,4 @@ def _checked(network: SavedNetwork, task: Task) -> Snapshot:
             f"these are {task.tables.data_version}"
         )
     task.check_known(network.run, classes.load_vocabulary(network.run).names)
-    if network.located.word_vectors is not None:
-        check_width(network.run, task.model, snapshot.weights, task.words.shape)
     return snapshot

@@ -45,25 +45,6 @@ def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
     return model.clone(spec=spec)
 
 
-def check_width(run: Path | str, model: ActorCritic, weights: Any, shape: tuple[int, ...]) -> None:
-    """Raises ValueError unless a network takes word vectors of a width.
-
-    Args:
-      run: what to call the network.
-      model: the network.
-      weights: its parameters.
-      shape: (C, D), of the table of word vectors.
-    """
-    words = jax.ShapeDtypeStruct(shape, jnp.float32)
-    wanted = jax.eval_shape(model.initialise, jax.random.key(0), words)
-    given, taken = (jax.tree.map(lambda leaf: leaf.shape, tree) for tree in (weights, wanted))
-    if given != taken:
-        raise ValueError(
-            f"{run}: was trained with word vectors of another width than {shape[1]}, which "
-            "--word-vectors gives"
-        )
-
-
 def resolve_precision(config: NetworkConfig) -> NetworkConfig:
     """The configuration with `precision` "auto" replaced by what is fastest on this machine."""
     if config.precision != "auto":

@@ -143,14 +143,15 @@ def snapshot(path: Path | str, weights: Any, **progress: Any) -> Snapshot:
     return Snapshot(weights=weights, **progress)
 
 
-def check_fit(path: Path | str, weights: Any, expected: Any) -> None:
+def check_fit(path: Path | str, weights: Any, expected: Any, width: int | None = None) -> None:
     """Checks that a network has the parameters of the model that its configuration describes.
 
     Args:
       expected: the model's parameters, or their shapes alone.
+      width: numbers in a word vector, if the vectors are not the bundled ones.
 
     Raises:
-      FileError: a name or a shape differs.
+      FileError: a name or a shape differs, for which `width` is then blamed.
     """
     ours, theirs = (
         {name: x.shape for name, x in traverse_util.flatten_dict(tree, sep="/").items()}
@@ -158,6 +159,12 @@ def check_fit(path: Path | str, weights: Any, expected: Any) -> None:
     )
     for name in sorted(ours.keys() | theirs.keys()):
         if ours.get(name) != theirs.get(name):
+            if width is not None:
+                raise FileError(
+                    path,
+                    f"was trained with word vectors of another width than {width}, which "
+                    "--word-vectors gives",
+                )
             raise FileError(
                 path,
                 f"does not fit the run's configuration: {name} is "
