@@ -17,7 +17,7 @@ BROKEN_PIPE = 128 + signal.SIGPIPE
 
 @contextlib.contextmanager
 def ends_with_its_reader() -> Iterator[None]:
-    """Ends the command silently, with status 141, once the reader of its output exits (`| head`)."""
+    """Ends a command silently, with status 141, once the reader of its output exits (`| head`)."""
     try:
         try:
             yield
