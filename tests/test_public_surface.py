@@ -81,6 +81,7 @@ class Stopper(Callbacks):
         return self.left == 0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ithor")
 def test_a_run_from_python_is_stopped(tmp_path: Path) -> None:
     folder, stopper = tmp_path / "run", Stopper(2)
@@ -121,11 +122,10 @@ def test_a_run_from_python_is_stopped_resumed_and_evaluated(tmp_path: Path) -> N
 
 @pytest.mark.usefixtures("ithor", "few_episodes")
 def test_policies_without_a_checkpoint(tmp_path: Path) -> None:
-    best = tdanet_jax.evaluate(policy="shortest_path", out=tmp_path / "best")
-    assert best["unseen"]["L>=1"]["SPL"] == 100
-    assert (tmp_path / "best" / "results.md").exists()
     random = policies.random()
-    seeds = [tdanet_jax.evaluate(policy=random, seed=seed) for seed in (0, 0, 1)]
+    again = tdanet_jax.evaluate(policy=random, out=tmp_path / "random")
+    assert (tmp_path / "random" / "results.md").exists()
+    seeds = [again, *(tdanet_jax.evaluate(policy=random, seed=seed) for seed in (0, 1))]
     assert seeds[0]["policy"] == seeds[0]["model"] == "custom"
     assert seeds[0] == seeds[1] != seeds[2]
     with pytest.raises(ValueError, match="policy greedy: needs a checkpoint"):

@@ -130,7 +130,15 @@ def decide_alike(agent, some_rooms, glove, rotation=0, steps=3):
 
 
 @pytest.mark.parametrize("rotation", [0, 225])
-@pytest.mark.parametrize("who", ["agent", "triangulating_agent", "merging_agent", "counting_agent"])
+@pytest.mark.parametrize(
+    "who",
+    [
+        "agent",
+        "triangulating_agent",
+        pytest.param("merging_agent", marks=pytest.mark.slow),
+        pytest.param("counting_agent", marks=pytest.mark.slow),
+    ],
+)
 def test_it_decides_as_the_network_does_in_the_environment(
     some_rooms, glove, who, rotation, request
 ):
@@ -294,6 +302,7 @@ def test_a_rotation_off_the_eight_is_refused(agent, odometry_agent, rotation):
             one.start(rotation)
 
 
+@pytest.mark.slow
 def test_a_network_of_ithors_rooms_goes_to_rooms_on_another_grid(some_rooms, glove, tmp_path):
     """In turns of 30 degrees and three horizons; evaluated there, and as an agent on its own."""
     grid = PoseGrid(0.25, 12, (-30, 0, 30))

@@ -180,12 +180,13 @@ def assert_worlds_agree(world: World, params: EnvParams, batch: int, steps: int,
     return successes
 
 
-def test_agrees_with_the_slow_world_in_real_rooms(some_rooms: SceneTables) -> None:
-    parents, named = random_parents(some_rooms, seed=1)
-    world = World(some_rooms, named, STEP_LIMITS, oracle.walk_on_grid(some_rooms))
-    params = make_params(some_rooms, TARGETS, parents, STEP_LIMITS, ObservationSpec())
-    successes = assert_worlds_agree(world, params, batch=40, steps=50, seed=2)
-    assert successes > 50, "the walk should reach targets, or little has been compared"
+def test_agrees_with_the_slow_world_in_real_rooms(ithor: SceneTables) -> None:
+    tables = ithor.subset(("FloorPlan29", "FloorPlan204", "FloorPlan303", "FloorPlan402"))
+    parents, named = random_parents(tables, seed=1)
+    world = World(tables, named, STEP_LIMITS, oracle.walk_on_grid(tables))
+    params = make_params(tables, TARGETS, parents, STEP_LIMITS, ObservationSpec())
+    successes = assert_worlds_agree(world, params, batch=20, steps=30, seed=2)
+    assert successes > 10, "the walk should reach targets, or little has been compared"
 
 
 def test_agrees_with_the_slow_world_in_rooms_built_from_boxes() -> None:
@@ -563,8 +564,9 @@ def test_rotations_of_other_grids_are_uniform_and_independent_of_the_target(rota
 
 
 @pytest.mark.parametrize("real", [True, False], ids=["real rooms", "houses"])
-def test_every_valid_episode_is_offered_and_no_other(some_rooms: SceneTables, real: bool) -> None:
-    tables, targets, ahead = some_rooms, TARGETS, oracle.walk_on_grid(some_rooms)
+def test_every_valid_episode_is_offered_and_no_other(ithor: SceneTables, real: bool) -> None:
+    tables = ithor.subset(("FloorPlan29", "FloorPlan402"))  # unconnected; connected
+    targets, ahead = TARGETS, oracle.walk_on_grid(tables)
     if not real:
         tables, targets = houses(), {"kitchen": ("Mug",), "bedroom": ("Pillow", "Mug")}
         ahead = None

@@ -52,12 +52,12 @@ def test_reset_and_step_are_those_of_the_dynamics_and_work_in_batches(
 ) -> None:
     params, keys = environment.default_params, jax.random.split(jax.random.key(0), 5)
     obs, state = jax.jit(jax.vmap(environment.reset))(keys)
-    chex.assert_trees_all_equal(
-        (obs, state), jax.vmap(dynamics.reset, (0, None))(keys, params), strict=True
-    )
+    reset = jax.jit(jax.vmap(dynamics.reset, (0, None)))
+    chex.assert_trees_all_equal((obs, state), reset(keys, params), strict=True)
     actions = jnp.array([Action.MOVE_AHEAD, Action.DONE, 1, 2, 4])
     found = jax.jit(jax.vmap(environment.step))(keys, state, actions)
-    expected = jax.vmap(dynamics.step, (0, 0, 0, None))(keys, state, actions, params)
+    step = jax.jit(jax.vmap(dynamics.step, (0, 0, 0, None)))
+    expected = step(keys, state, actions, params)
     chex.assert_trees_all_equal(found, expected, strict=True)
     assert found[3].tolist() == [False, True, False, False, False]  # terminated
 

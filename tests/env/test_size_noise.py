@@ -20,7 +20,7 @@ from tdanet_jax.task import make_task
 from tdanet_jax.words import WordVectors
 from tests.support.oracle import ROOMS
 
-BATCH, STEPS, NOISE = 128, 40, 0.5
+BATCH, STEPS, NOISE = 64, 30, 0.5
 
 
 def params_of(tables: SceneTables, noise: float) -> EnvParams:

@@ -200,7 +200,7 @@ def test_perturbing_all_hidden_data_changes_nothing_that_training_reads(
     ("model", "paid"),
     [
         ("tdanet", "parents"),
-        ("ssnet", "similarity"),
+        pytest.param("ssnet", "similarity", marks=pytest.mark.slow),
         pytest.param("mjolnir-o", "parents", marks=pytest.mark.slow),
     ],
 )

@@ -18,6 +18,7 @@ from tests.support import command
 from tests.support.pages import block
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ithor")  # the rooms are there: no line about computing them
 def test_the_example_on_the_page_is_a_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -159,6 +159,7 @@ def test_every_network_and_policy_has_its_own_folder(tmp_path):
         assert attention.default_folder(attention.Command(checkpoint, choice)) == run / name
 
 
+@pytest.mark.slow
 def test_a_model_that_sees_an_image_and_adapts_is_shown_next_to_another(
     tmp_path, capsys, rooms_file, opinionated_run, some_rooms, glove
 ):
@@ -214,6 +215,7 @@ def test_a_model_that_was_trained_on_feature_maps_sees_those_of_the_rooms(
     assert "features.npy: no such file; import with --features" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_page_of_a_real_room_as_a_user_asks_for_it(opinionated_run, tmp_path):
     """Through the whole command, into a browser."""
     out = tmp_path / "replay.html"

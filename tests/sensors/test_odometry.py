@@ -457,6 +457,7 @@ def test_without_odometry_everything_else_is_the_same(some_rooms: SceneTables) -
     chex.assert_trees_all_equal(more.replace(sensors={}), obs)
 
 
+@pytest.mark.slow
 def test_an_automatic_reset_begins_a_new_map() -> None:
     params = params_of(toy_rooms(), sensors=True, limits=(7,) * 4)
     reset, step = (jax.jit(jax.vmap(f, axes)) for f, axes in (

@@ -26,9 +26,10 @@ from tdanet_jax.training import learner
 from tests.training.test_learner import CONFIG, MODEL, PARAMS, WORDS
 
 config = dataclasses.replace(CONFIG, num_envs=24)
+init = jax.jit(lambda key: learner.init(key, config, MODEL, WORDS, PARAMS))
 ends = []
 for over in (Mesh(np.array(jax.devices()[:1]), (devices.AXIS,)), mesh):
-    state = learner.init(jax.random.key(0), config, MODEL, WORDS, PARAMS)
+    state = init(jax.random.key(0))
     layout = devices.layout(state, over)
     state = jax.device_put(state, layout)
     words, params = jax.device_put((WORDS, PARAMS), devices.everywhere(over))

@@ -26,7 +26,11 @@ MODEL = ActorCritic(BaselineEncoder(dropout=0.25), hidden=H)
 MAPS = ActorCritic(BaselineEncoder(dropout=0.25, maps=True), hidden=H)
 CASES = pytest.mark.parametrize(
     ("model", "dropped"),
-    [pytest.param(MODEL, False, marks=pytest.mark.slow), (MODEL, True), (MAPS, True)],
+    [
+        pytest.param(MODEL, False, marks=pytest.mark.slow),
+        (MODEL, True),
+        pytest.param(MAPS, True, marks=pytest.mark.slow),
+    ],
     ids=["evaluating", "training", "training on feature maps"],
 )
 
