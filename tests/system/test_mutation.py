@@ -352,6 +352,11 @@ FAULTS = (
           "self.turn * rotation", "test_poses.py"),
     Fault("every map has cells of a quarter metre", ODOMETRY, "POSITION_SCALE / self.grid.grid_size",
           "POSITION_SCALE / 0.25", "sensors/test_odometry.py"),
+    Fault("resets drawn with the action's key", LEARNER, "_reset(reset_key, params, batch)",
+          "_reset(action_key, params, batch)", "system/test_random_keys.py"),
+    Fault("one key for every step of a test", "evaluation/rollout.py",
+          "jax.random.fold_in(key, step), state, params", "key, state, params",
+          "system/test_random_keys.py"),
 )  # fmt: skip
 
 
