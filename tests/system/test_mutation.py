@@ -357,6 +357,20 @@ FAULTS = (
     Fault("one key for every step of a test", "evaluation/rollout.py",
           "jax.random.fold_in(key, step), state, params", "key, state, params",
           "system/test_random_keys.py"),
+    Fault("hidden classes among published parents", "env/reward.py",
+          "if name in tables.classes and name not in hidden", "if name in tables.classes",
+          "env/test_hidden_inputs.py"),
+    Fault("a parent fewer than there are", "env/reward.py", "best[:PARENTS_PER_TARGET]",
+          "best[:PARENTS_PER_TARGET - 1]", "env/test_hidden_inputs.py"),
+    Fault("hidden classes in the class graph", "models/classes.py",
+          "for i in known for j in known if i < j and weights[i, j]",
+          "for i in range(len(names)) for j in range(len(names)) if i < j and weights[i, j]",
+          "env/test_hidden_inputs.py"),
+    Fault("hidden classes in the raster", "env/zero_shot.py",
+          "raster[(raster >= 0) & gone[raster]] = -1", "pass", "env/test_hidden_inputs.py"),
+    Fault("hidden targets of custom room types", "scenes/dataset.py",
+          "for name in held if name not in split.hidden", "for name in held",
+          "env/test_hidden_inputs.py"),
 )  # fmt: skip
 
 
