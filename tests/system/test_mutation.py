@@ -371,6 +371,13 @@ FAULTS = (
     Fault("hidden targets of custom room types", "scenes/dataset.py",
           "for name in held if name not in split.hidden", "for name in held",
           "env/test_hidden_inputs.py"),
+    Fault("intervals over rooms, not pairs", "evaluation/report.py",
+          "scene.astype(np.int64) * len(tables.targets) + episodes.target", "scene.astype(np.int64)",
+          "evaluation/test_reported_figures.py"),
+    Fault("the page counts episodes of one action", "evaluation/report.py",
+          'column["shortest"] == 1', 'column["length"] == 1', "evaluation/test_reported_figures.py"),
+    Fault("a sweep's minutes are seconds", "workflows/sweep_report.py", "run.seconds / 60",
+          "run.seconds", "workflows/test_sweep_report_figures.py"),
 )  # fmt: skip
 
 
