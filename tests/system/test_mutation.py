@@ -378,6 +378,8 @@ FAULTS = (
           'column["shortest"] == 1', 'column["length"] == 1', "evaluation/test_reported_figures.py"),
     Fault("a sweep's minutes are seconds", "workflows/sweep_report.py", "run.seconds / 60",
           "run.seconds", "workflows/test_sweep_report_figures.py"),
+    Fault("a resumed run begins its minutes anew", "training/run.py",
+          '        self.seconds = float(meta["seconds"])\n', "", "training/test_run_bookkeeping.py"),
 )  # fmt: skip
 
 
