@@ -380,6 +380,10 @@ FAULTS = (
           "run.seconds", "workflows/test_sweep_report_figures.py"),
     Fault("a resumed run begins its minutes anew", "training/run.py",
           '        self.seconds = float(meta["seconds"])\n', "", "training/test_run_bookkeeping.py"),
+    Fault("a flag of the learner is ignored", LEARNER, "steps.bootstrap_only, config.gamma,",
+          "steps.bootstrap_only, 0.99,", "experiments/test_flags.py"),
+    Fault("checkpoints every two minutes whatever is said", "workflows/train.py",
+          "> 60 * runs[0].config.checkpoint_minutes", "> 60 * 2.0", "experiments/test_flags.py"),
 )  # fmt: skip
 
 
