@@ -57,8 +57,8 @@ def rooms(studio: tuple[str, ...] = ("Bread", HIDDEN, SEEN)) -> SceneTables:
     )
 
 
-@pytest.fixture(scope="module")
-def vectors() -> WordVectors:
+def word_vectors() -> WordVectors:
+    """Vectors of four numbers for the words of these classes."""
     words = ("arm", "chair", "bread", "cabinet", "coffee", "machine", "counter", "top", "fridge",
              "sink")  # fmt: skip
     drawn = np.random.default_rng(0).normal(size=(len(words), 4)).astype(np.float32)
@@ -145,11 +145,13 @@ CONFIGS = tuple(
 )
 
 
-def bases(vectors: WordVectors) -> tuple[Inputs, Inputs]:
+def bases() -> tuple[Inputs, ...]:
     """Rooms that came with parents and a class graph, and rooms in which they are found."""
     weights = np.full((len(CLASSES), len(CLASSES)), 0.5, np.float32)
     published = Extras({"kitchen": PARENTS}, (), CLASSES, weights, PARTS)
-    return Inputs(rooms(), vectors, published), Inputs(rooms(), vectors, Extras(parts=PARTS))
+    return tuple(
+        Inputs(rooms(), word_vectors(), extras) for extras in (published, Extras(parts=PARTS))
+    )
 
 
 def read_by_training(inputs: Inputs) -> dict[str, Any]:
@@ -175,19 +177,17 @@ def differing(one: Inputs, other: Inputs) -> list[str]:
 
 
 @pytest.mark.parametrize("entrance", ENTRANCES)
-def test_what_an_input_says_of_a_hidden_class_is_ignored(
-    entrance: str, vectors: WordVectors
-) -> None:
+def test_what_an_input_says_of_a_hidden_class_is_ignored(entrance: str) -> None:
     change = ENTRANCES[entrance]
     noticed = []
-    for base in bases(vectors):
+    for base in bases():
         assert differing(base, change(base, HIDDEN)) == []
         noticed += differing(base, change(base, SEEN))
     assert noticed, "what it says of a class that is not hidden should matter"
 
 
-def test_hidden_parents_leave_their_slots_to_others(vectors: WordVectors) -> None:
-    inputs = ENTRANCES["published parents"](bases(vectors)[0], HIDDEN)
+def test_hidden_parents_leave_their_slots_to_others() -> None:
+    inputs = ENTRANCES["published parents"](bases()[0], HIDDEN)
     task = make_task(CONFIGS[0], inputs.tables, inputs.vectors, inputs.extras)
     goal = TARGETS.index("Bread")
     found = [CLASSES[c] for c in np.asarray(task.train_params.parent_class[goal])]
@@ -195,15 +195,15 @@ def test_hidden_parents_leave_their_slots_to_others(vectors: WordVectors) -> Non
     np.testing.assert_allclose(task.train_params.parent_reward[goal], [0.4, 0.3, 0.2])
 
 
-def test_published_episodes_are_not_for_training(vectors: WordVectors) -> None:
-    base = bases(vectors)[0]
+def test_published_episodes_are_not_for_training() -> None:
+    base = bases()[0]
     episode = PublishedEpisode("test", "Room3", 0.0, 0.0, 0, 0, HIDDEN)
     extras = dataclasses.replace(base.extras, episodes=(episode,))
     assert differing(base, base._replace(extras=extras)) == []
 
 
-def test_no_target_of_training_is_hidden_in_any_room_type(vectors: WordVectors) -> None:
-    task: Task = make_task(CONFIGS[0], *bases(vectors)[1])
+def test_no_target_of_training_is_hidden_in_any_room_type() -> None:
+    task: Task = make_task(CONFIGS[0], *bases()[1])
     asked = {TARGETS[goal] for goal in np.unique(task.train_params.pair_target)}
     assert asked == {"ArmChair", "Bread"}
     assert task.split.seen["studio"] == ("Bread", "ArmChair")

@@ -38,8 +38,8 @@ from tdanet_jax.scenes import SceneTables
 from tdanet_jax.task import load_task, make_task
 from tdanet_jax.training import learner
 from tdanet_jax.training.callbacks import Callbacks
-from tdanet_jax.words import WordVectors
 from tdanet_jax.workflows import train as workflow
+from tests.env import test_hidden_inputs as hidden
 from tests.support import handmade, samples
 
 TESTS = Path(__file__).resolve().parents[1]
@@ -275,6 +275,14 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
     "replay": (SHOW, {**ONE_EPISODE, "--shortest": "--shortest"}),
     "trajectories": (SHOW, {**ONE_EPISODE, "--shortest": "--shortest"}),
     "attention": (SHOW, ONE_EPISODE | {"--checkpoint": ("--checkpoint run", "--checkpoint other")}),
+    # Without an episode, it plays the test episodes.
+    "attention ": (
+        "--checkpoint run",
+        {
+            flag: ONE_EPISODE[flag]
+            for flag in ("--seed", "--data", "--word-vectors", "--policy", "--out")
+        },
+    ),
     "sweep": (
         "--out new --seeds 0 --steps 1",
         {
@@ -422,7 +430,7 @@ def test_every_flag_has_a_row() -> None:
     classes |= {f"scenes {name}": one for name, one in scenes_command.COMMANDS.items()}
     for name, command in classes.items():
         assert set(flags_of(command)) == set(ROWS[name][1]), name
-    assert set(classes) == set(ROWS)
+    assert set(classes) == {name.strip() for name in ROWS}
 
 
 #: Settings of a run -> the test that shows what they do.
@@ -487,39 +495,22 @@ def changed(config: TrainConfig, name: str, value: Any) -> TrainConfig:
 
 
 @functools.cache
-def contents(config: TrainConfig, tables: Any, vectors: Any) -> tuple[Any, ...]:
-    """Everything that a run takes from its task."""
-    task = make_task(config, tables.value, vectors.value)
+def contents(config: TrainConfig) -> tuple[Any, ...]:
+    """Everything that a run takes from its task, in small rooms."""
+    task = make_task(config, *hidden.bases()[1])
     leaves, tree = jax.tree.flatten((task.train_params, task.train_words))
     return task.model, task.split.name, str(tree), [np.asarray(leaf).tobytes() for leaf in leaves]
 
 
-class Same:
-    """Something that is equal to itself alone."""
-
-    def __init__(self, value: Any) -> None:
-        self.value = value
-
-
-@pytest.fixture(scope="module")
-def rooms(some_rooms: SceneTables) -> Same:
-    return Same(some_rooms)
-
-
-@pytest.fixture(scope="module")
-def vectors(glove: WordVectors) -> Same:
-    return Same(glove)
-
-
 @pytest.mark.parametrize("name", OF_THE_TASK)
-def test_a_setting_makes_another_task(name: str, rooms: Same, vectors: Same) -> None:
+def test_a_setting_makes_another_task(name: str) -> None:
     value, model = OF_THE_TASK[name]
     config = TrainConfig(model=model, network=NetworkConfig(precision="float32", image="raster"))
     if name == "triangulation":
         config = changed(config, "odometry", True)
     other = changed(config, name, value)
     other.check()
-    assert contents(config, rooms, vectors) != contents(other, rooms, vectors)
+    assert contents(config) != contents(other)
 
 
 def test_every_number_of_the_learner_changes_an_update() -> None:
