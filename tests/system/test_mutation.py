@@ -384,6 +384,19 @@ FAULTS = (
           "steps.bootstrap_only, 0.99,", "experiments/test_flags.py"),
     Fault("checkpoints every two minutes whatever is said", "workflows/train.py",
           "> 60 * runs[0].config.checkpoint_minutes", "> 60 * 2.0", "experiments/test_flags.py"),
+    Fault("slivers are visible", "scenes/visibility/build.py", "whole * rules.sliver", "0.0",
+          "analysis/test_shown_by_hand.py"),
+    Fault("dashes for what is within reach", "analysis/drawing.py",
+          "DASHED if sought[i] and not seen.visible[i]", "DASHED if sought[i] and seen.visible[i]",
+          "analysis/test_shown_by_hand.py"),
+    Fault("a picture's colours are exchanged", "analysis/pictures.py",
+          "_COLORS = {True: GREEN, False: BLUE}", "_COLORS = {True: BLUE, False: GREEN}",
+          "analysis/test_shown_by_hand.py"),
+    Fault("Done anywhere is a success in a trace", "analysis/trace.py",
+          "tables.distance[pose[-1], goal] == 0)", "tables.distance[pose[-1], goal] >= 0)",
+          "analysis/test_shown_by_hand.py"),
+    Fault("all on a page is within reach", "analysis/replay.py", "bool(near)]", "True]",
+          "analysis/test_shown_by_hand.py"),
 )  # fmt: skip
 
 
