@@ -1,0 +1,103 @@
+"""A run that is loaded again knows all that it knew: every attribute, not its arrays alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.scenes import SceneTables
+from tdanet_jax.task import Task, make_task
+from tdanet_jax.training.checkpoint import Checkpoints
+from tdanet_jax.training.journal import read_metrics
+from tdanet_jax.training.learner import TrainState
+from tdanet_jax.training.run import _UPDATE_MEANS, Run
+from tdanet_jax.words import WordVectors
+
+CONFIG = TrainConfig(
+    minutes=10.0,
+    max_skipped=3,
+    learner=LearnerConfig(num_envs=2, rollout_steps=5, step_limit=6),
+    network=NetworkConfig(width=4, hidden=4, precision="float32"),
+)
+#: Attributes of a run that a checkpoint need not hold, and why.
+NOT_KEPT = {
+    "checkpoints": "an open folder",
+    "_journal": "an open file; its rows are compared",
+    "_skipped_before": "counts from each start; compared below",
+}
+
+
+@pytest.fixture(scope="module")
+def task(some_rooms: SceneTables, glove: WordVectors) -> Task:
+    return make_task(CONFIG, some_rooms, glove)
+
+
+@pytest.fixture(autouse=True)
+def begins_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new run has made-up arrays: nothing is compiled, and no two leaves agree."""
+
+    def begin(run: Run) -> TrainState:
+        shapes = jax.eval_shape(run._init, jax.random.key(0), run._words, run._params)
+        leaves, tree = jax.tree.flatten(shapes.replace(key=jnp.zeros(2, jnp.uint32)))
+        made = [jnp.full(x.shape, 1 + i % 100, x.dtype) for i, x in enumerate(leaves)]
+        state: TrainState = jax.tree.unflatten(tree, made)
+        return state.replace(key=jax.random.wrap_key_data(state.key))
+
+    monkeypatch.setattr(Run, "_begin", begin)
+
+
+def saved(folder: Path, task: Task, **counts: int) -> Run:
+    """A run after 30 updates and 6 of its 10 minutes, saved."""
+    run = Run(folder, CONFIG, task)
+    counters = {"updates": 30, "episodes": 77, "skipped": 5} | counts
+    run.state = run.state.replace(**{k: jnp.int32(v) for k, v in counters.items()})
+    run.seconds = 360.25
+    run.save()
+    return run
+
+
+def plain(value: Any) -> Any:
+    """Something that compares by `==`."""
+    if isinstance(value, jax.Array | np.ndarray):
+        if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+            value = jax.random.key_data(value)
+        return str(value.dtype), value.shape, np.asarray(value).tolist()
+    leaves, tree = jax.tree.flatten(value)
+    return value if leaves == [value] else (str(tree), [plain(leaf) for leaf in leaves])
+
+
+def test_every_attribute_is_as_it_was(task: Task, tmp_path: Path) -> None:
+    run = saved(tmp_path, task)
+    again = Run(tmp_path, CONFIG, task)
+    assert vars(again).keys() == vars(run).keys()
+    for name, value in vars(run).items():
+        if name not in NOT_KEPT:
+            assert plain(getattr(again, name)) == plain(value), name
+    assert again._skipped_before == 5
+    for name in ("title", "steps", "progress"):
+        assert getattr(again, name) == getattr(run, name)
+    assert plain(again._shares()) == plain(run._shares())
+    assert plain(vars(again.snapshot(3))) == plain(vars(run.snapshot(3)))
+    assert plain(vars(Checkpoints(tmp_path).snapshot())) == plain(vars(run.snapshot()))
+
+
+def test_time_and_rows_continue(task: Task, tmp_path: Path) -> None:
+    saved(tmp_path, task)
+    again = Run(tmp_path, CONFIG, task)
+    assert again.progress == pytest.approx(360.25 / 600)
+    again._open_journal()
+    metrics = {name: np.ones(1) for name in (*_UPDATE_MEANS, "bootstrap_only_steps", "reward_sum")}
+    metrics |= {name: np.full(1, 2.0) for name in ("success_sum", "spl_sum", "length_sum")}
+    metrics["episodes"] = np.array([4])
+    row = again._record(again.state, metrics, again.progress, took=239.0)
+    assert row["seconds"] == 599.25
+    assert read_metrics(tmp_path) == [row]
+    assert again.progress < 1.0
+    again._record(again.state, metrics, again.progress, took=0.75)
+    assert list(again.chunks()) == []  # ten minutes in all: the budget is spent
