@@ -38,6 +38,10 @@ settings.load_profile("tests")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Processes that tests start import the code under test, from whichever folder they are started.
+_paths = [str(Path(__file__).resolve().parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+os.environ |= {"PYTHONPATH": os.pathsep.join(_paths), "PYTHONSAFEPATH": "1"}
+
 # What one test or command has compiled, the next one need not, in whichever process: for this
 # session alone. The workers of pytest-xdist inherit the folder; a limit of its size brings locks.
 if "PYTEST_XDIST_WORKER" not in os.environ:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import pkgutil
 import subprocess
 import sys
@@ -30,7 +29,6 @@ def loaded(code: str) -> list[str]:
     """The modules that a program loads in a process of its own."""
     done = subprocess.run(
         [sys.executable, "-c", f"import sys\n{code}\nprint(*sys.modules)"],
-        env=os.environ | {"PYTHONPATH": os.getcwd()},
         capture_output=True,
         text=True,
         check=True,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
@@ -18,12 +17,11 @@ def notebook():
     return nbformat.read(NOTEBOOK, as_version=4)
 
 
-def test_it_runs(notebook, opinionated_run, tmp_path, monkeypatch):
+def test_it_runs(notebook, opinionated_run, tmp_path):
     first = next(cell for cell in notebook.cells if cell.cell_type == "code")
     (name,) = re.findall(r'^RUN = "(.*)"', first.source, re.MULTILINE)
     assert (NOTEBOOK.parent / name / "config.json").exists()
     first.source = first.source.replace(name, str(opinionated_run))
-    monkeypatch.setenv("PYTHONPATH", os.getcwd())
     nbclient.NotebookClient(
         notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}
     ).execute()

@@ -82,7 +82,7 @@ def drop_in_a_thread() -> None:
     thread.join()
 
 
-def status(body: Callable[[], object], seconds: float = 2.0) -> int | str | None:
+def status(body: Callable[[], object], seconds: float = 60.0) -> int | str | None:
     """The exit status of a command that waits after `body`; None if it runs to its end."""
     try:
         with console.one_line_errors():

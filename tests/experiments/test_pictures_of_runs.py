@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-import os
 import re
 import subprocess
 import sys
@@ -222,7 +221,7 @@ def test_the_page_of_a_real_room_as_a_user_asks_for_it(opinionated_run, tmp_path
     done = subprocess.run(
         [sys.executable, "-m", "experiments.replay", "--checkpoint", str(opinionated_run),
          "--scene", "FloorPlan228", "--target", "Laptop", "--policy", "greedy", "--out", str(out)],
-        capture_output=True, text=True, env=os.environ | {"PYTHONPATH": os.getcwd()},
+        capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "Laptop in FloorPlan228\n  my-run: " in done.stdout

@@ -25,11 +25,36 @@ WRITTEN = {
 }  # fmt: skip
 
 
-def wait_for(found, seconds=120):
+def wait_for(found, seconds=600):
     deadline = time.monotonic() + seconds
     while not found():
         assert time.monotonic() < deadline
         time.sleep(0.002)
+
+
+#: Holds a command in the middle of a checkpoint, from the moment when {held} is there until
+#: {go_on} is.
+HOLD = """
+import pathlib, sys, time
+def hold(event, given):
+    if event == "os.rename" and str(given[1]).endswith("{checkpoint}"):
+        pathlib.Path("{held}").touch()
+        while not pathlib.Path("{go_on}").exists():
+            time.sleep(0.01)
+sys.addaudithook(hold)
+"""
+
+
+def start_held(checkpoint, folder, *arguments):
+    """Starts training that is held in a checkpoint; and the file to make for it to go on."""
+    folder.mkdir()
+    held, go_on = folder / "held", folder / "go_on"
+    code = HOLD.format(checkpoint=checkpoint, held=held, go_on=go_on)
+    (folder / "sitecustomize.py").write_text(code)
+    paths = os.pathsep.join((str(folder), os.environ["PYTHONPATH"]))
+    process = command.start("train_zero_shot", *arguments, variables={"PYTHONPATH": paths})
+    wait_for(lambda: held.exists() or process.poll() is not None)
+    return process, go_on
 
 
 @pytest.mark.slow
@@ -38,20 +63,22 @@ def test_it_trains_evaluates_and_goes_on_after_kill_and_term(ithor, tmp_path, ca
     out = tmp_path / "run"
     metrics, checkpoints = out / "metrics.jsonl", out / "checkpoints"
     arguments = ["--split", "14/8", "--steps", "12000", "--checkpoint-minutes", "1e-6"]
-    process = command.start("train_zero_shot", *arguments, *command.TINY, "--out", out)
-    wait_for(lambda: metrics.exists() and any(checkpoints.glob(f"{files.PARTIAL}*")))
+    arguments += [*command.TINY, "--out", out]
+    process, _ = start_held("checkpoints/20", tmp_path / "first", *arguments)
+    assert any(checkpoints.glob(f"{files.PARTIAL}*"))
     process.kill()
     process.communicate()
     assert process.returncode == -signal.SIGKILL
 
     rows = len(metrics.read_text().splitlines())
-    process = command.start("train_zero_shot", "--resume", out)
-    wait_for(lambda: len(metrics.read_text().splitlines()) > rows)
+    process, go_on = start_held("checkpoints/100", tmp_path / "second", "--resume", out)
+    assert len(metrics.read_text().splitlines()) > rows
     with pytest.raises(SystemExit):
         train_zero_shot.main(["--resume", str(out)])
     assert capsys.readouterr().err == f"error: {out}: in use by another process\n"
     process.send_signal(signal.SIGTERM)
-    said, _ = process.communicate(timeout=120)
+    go_on.touch()
+    said, _ = process.communicate(timeout=600)
     assert process.returncode == 128 + signal.SIGTERM
     assert "half-written when the run was stopped" in said
     assert (
@@ -144,7 +171,7 @@ def test_two_processes_train_together_and_one_goes_on_alone(ithor, tmp_path):
         )
         for number in (0, 1)
     ]
-    said = [process.communicate(timeout=240)[0] for process in both]
+    said = [process.communicate(timeout=600)[0] for process in both]
     assert [process.returncode for process in both] == [0, 0]
     assert "wrote" in said[0]
     assert "steps/s" not in said[1]

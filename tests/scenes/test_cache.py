@@ -92,7 +92,7 @@ def test_a_cache_that_cannot_be_written(folder: Path, monkeypatch: pytest.Monkey
 
 
 def start_building(folder: Path) -> subprocess.Popen[str]:
-    environment = {**os.environ, cache.VARIABLE: str(folder), "PYTHONPATH": os.getcwd()}
+    environment = {**os.environ, cache.VARIABLE: str(folder)}
     command = [sys.executable, "-c", BUILDER]
     pipe = subprocess.PIPE
     return subprocess.Popen(
@@ -100,16 +100,22 @@ def start_building(folder: Path) -> subprocess.Popen[str]:
     )
 
 
-def first_line(pipe: IO[str] | None) -> str:
+def read_until(pipe: IO[str] | None, text: str) -> str:
+    """The lines up to the first that holds `text`, or up to the end."""
     assert pipe is not None
-    return pipe.readline()
+    lines = []
+    for line in pipe:
+        lines.append(line)
+        if text in line:
+            break
+    return "".join(lines)
 
 
 def test_one_of_several_processes_builds_and_the_others_wait(tmp_path: Path) -> None:
     first = start_building(tmp_path)
-    began = first_line(first.stdout)
+    began = read_until(first.stdout, "building")
     running = [first, start_building(tmp_path), start_building(tmp_path)]
-    told = ["", *(first_line(process.stderr) for process in running[1:])]  # now they wait
+    told = ["", *(read_until(p.stderr, "waiting for it") for p in running[1:])]  # now they wait
     rest = [process.communicate("go\n") for process in running]
     said = [(out, line + err) for (out, err), line in zip(rest, told, strict=True)]
     said[0] = (began + said[0][0], said[0][1])

@@ -21,7 +21,7 @@ def start(
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PYTHONPATH": os.getcwd(), "PYTHONUNBUFFERED": "1"} | (variables or {}),
+        env=os.environ | {"PYTHONUNBUFFERED": "1"} | (variables or {}),
         **options,
     )
 

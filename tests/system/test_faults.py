@@ -227,7 +227,7 @@ def test_a_signal_waits_until_a_library_is_loaded(
     machine: training may have begun, and then it is saved and says more.
     """
     (tmp_path / "sitecustomize.py").write_text(STRIKER.format(name=name, sent=int(sent)))
-    path = {"PYTHONPATH": os.pathsep.join((str(tmp_path), os.getcwd()))}
+    path = {"PYTHONPATH": os.pathsep.join((str(tmp_path), os.environ["PYTHONPATH"]))}
     done = command.run(module, *arguments, tmp_path / "out.png", variables=path)
     assert done.returncode == 128 + sent, done.stderr
     *said, loaded = done.stdout.splitlines()
@@ -246,7 +246,7 @@ def test_a_signal_waits_until_a_library_is_loaded(
 
 def test_ctrl_c_ends_a_command_that_has_not_begun_without_a_word(tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(STRIKER.format(name="tyro", sent=2))
-    path = {"PYTHONPATH": os.pathsep.join((str(tmp_path), os.getcwd()))}
+    path = {"PYTHONPATH": os.pathsep.join((str(tmp_path), os.environ["PYTHONPATH"]))}
     done = command.run("evaluate", "--help", variables=path)
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
 
@@ -254,7 +254,7 @@ def test_ctrl_c_ends_a_command_that_has_not_begun_without_a_word(tmp_path: Path)
 def in_shell(tmp_path: Path, line: str, name: str, sent: int) -> tuple[int, str, str]:
     """Exit status, output and errors of a shell's line; `name` and `sent` as above."""
     (tmp_path / "sitecustomize.py").write_text(STRIKER.format(name=name, sent=int(sent)))
-    path = {"PYTHONPATH": os.pathsep.join((str(tmp_path), os.getcwd()))}
+    path = {"PYTHONPATH": os.pathsep.join((str(tmp_path), os.environ["PYTHONPATH"]))}
     words = ["sh", "-c", line.replace("python", shlex.quote(sys.executable))]
     done = subprocess.run(words, env=os.environ | path, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout, done.stderr

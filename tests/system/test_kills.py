@@ -112,7 +112,7 @@ def test_killed_at_random_moments_a_run_ends_as_one_that_was_not(tmp_path: Path)
         strike(process, out, draw, kind)
         assert process.poll() is None, process.communicate()
         process.send_signal(sent)
-        said, error = process.communicate(timeout=180)
+        said, error = process.communicate(timeout=600)
         struck.append((kind, sent.name, process.returncode, newest))
         assert process.returncode in (-sent, 128 + sent), (struck, said, error)
         # "stopped": before the run, while the command line is read.

@@ -26,7 +26,7 @@ print(tabulation.build([toy.random_room(draw, name=f"Room{i}") for i in range(4)
 
 def in_process(code: str, **environment: str) -> str:
     """What a program prints in a process of its own."""
-    variables = os.environ | {"PYTHONPATH": os.getcwd()} | environment
+    variables = os.environ | environment
     done = subprocess.run(
         [sys.executable, "-c", code], env=variables, capture_output=True, text=True, check=True
     )
