@@ -15,6 +15,7 @@ from tdanet_jax.io.untrusted import FileError, jsons, regular
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.registry import MODELS, SENSORS
 from tdanet_jax.splits import file_name, make_split, split_name
+from tdanet_jax.targets import canonical, known_classes
 
 #: Environment steps of a run without a budget.
 DEFAULT_STEPS = 12_000_000
@@ -122,6 +123,10 @@ class TrainConfig:
     split: str = "18/4"
     """Seen/unseen target classes: 22/0, 18/4 or 14/8; or a comma-separated list of unseen classes:
     Mug,Vase,CD,Towel."""
+    targets: str = "paper"
+    """Classes to look for. paper: its 22, or those that the rooms of --data name themselves. all:
+    every class that can be found in a training room, by room type. Or classes, separated by commas:
+    Kettle,Mug,Book; for some room types: 'kitchen: Kettle, Mug; bedroom: Book, Pillow'."""
     model: str = "tdanet"
     """The model: tdanet, one of its ablations (tdanet-no-ta without target attention, tdanet-no-sa
     without the Siamese comparison, tdanet-no-ta-sa without either), ssnet, mjolnir-o, mjolnir-r
@@ -169,7 +174,9 @@ class TrainConfig:
                     wanted = "finite" if isinstance(value, float) else f"of type {kind}"
                     raise ValueError(f"--{name.replace('_', '-')} {value}: must be {wanted}")
         check_seed(self.seed)
-        make_split(self.split, self.validation)
+        split_name(self.split, known_classes(self.targets, self.data))
+        if self.targets == "paper" and self.data is None:
+            make_split(self.split, self.validation)
         if self.model not in MODELS and "." not in self.model:
             known = ", ".join(MODELS)
             raise ValueError(f"--model {self.model}: choose one of {known}, or name a module")
@@ -190,7 +197,8 @@ class TrainConfig:
 
         return dataclasses.replace(
             self,
-            split=split_name(self.split),
+            split=split_name(self.split, None),
+            targets=canonical(self.targets),
             data=absolute(self.data),
             word_vectors=absolute(self.word_vectors),
         )

@@ -12,6 +12,7 @@ from tdanet_jax.io import assets
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.splits import GROUPS, UNSEEN, Split, make_split
+from tdanet_jax.vocabulary import ALL_TARGETS
 
 ASSET = "episodes.npz"
 EPISODES_PER_ROOM_TYPE = 250
@@ -146,14 +147,16 @@ def published(
 
 
 def _committed(tables: SceneTables, split: Split) -> dict[str, Episodes]:
-    """The stored lists of a published split; none of another."""
+    """The stored lists of a published split with the paper's targets; none of another."""
     with np.load(assets.path(ASSET), allow_pickle=False) as data:
         version = bytes(data["data_version"]).decode()
-        if version != tables.data_version:
+        if tables.targets == ALL_TARGETS and version != tables.data_version:
             raise ValueError(
                 f"{ASSET} belongs to scene tables {version}, these are {tables.data_version}: "
                 "reinstall tdanet_jax, or run `python -m experiments.scenes build`"
             )
+        if not any(_same_targets(split, make_split(n, v)) for n in UNSEEN for v in (False, True)):
+            return {}
         return {
             group: Episodes(
                 data[f"{split.name}/{group}/pose"], data[f"{split.name}/{group}/target"]
@@ -161,3 +164,8 @@ def _committed(tables: SceneTables, split: Split) -> dict[str, Episodes]:
             for group in GROUPS
             if f"{split.name}/{group}/pose" in data
         }
+
+
+def _same_targets(one: Split, other: Split) -> bool:
+    """Whether two splits have one name, and seen and unseen targets in the same room types."""
+    return (one.name, one.seen, one.unseen) == (other.name, other.seen, other.unseen)

@@ -203,7 +203,7 @@ def _task_config(network: SavedNetwork) -> TrainConfig:
 
     Runs of one task thus compare equal.
     """
-    kept = ("split", "model", "validation", "network", "data", "word_vectors")
+    kept = ("split", "targets", "model", "validation", "network", "data", "word_vectors")
     located = network.located
     values: dict[str, Any] = {name: getattr(located, name) for name in kept}
     if located.word_vectors is not None:  # every run has a copy of its own

@@ -186,7 +186,7 @@ def _comparison(report: Report, split: str) -> Iterator[str]:
         )
         for label, out in summaries.items()
     ]
-    theirs = paper.rates(split)
+    theirs = paper.rates(split, next(iter(results.values()))[0].get("targets"))
     rows += [((f"{agent} (paper)", "", ""), groups) for agent, groups in theirs.items()]
     tables = " (the paper's Tables I to III)" if split in PAPER_SPLITS else ""
     yield from ("", f"## Split {split}: comparison of models{tables}", "")

@@ -15,7 +15,7 @@ BUCKET = {"SR", "SPL", "SR_ci", "SPL_ci", "n"}
 TOP = [
     "version", "split", "model", "policy", "episodes_trained", "seen", "unseen", "by_room",
     "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "sensors",
-    "departures", "odometry", "triangulation", "commit",
+    "departures", "targets", "odometry", "triangulation", "commit",
 ]  # fmt: skip
 
 
