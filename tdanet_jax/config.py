@@ -14,7 +14,8 @@ from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import FileError, jsons, regular
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.registry import MODELS, SENSORS
-from tdanet_jax.splits import file_name, make_split, split_name
+from tdanet_jax.splits import OPEN, file_name, make_split, split_name
+from tdanet_jax.targets import PAPER as PAPER_TARGETS
 from tdanet_jax.targets import canonical, known_classes
 
 #: Environment steps of a run without a budget.
@@ -122,7 +123,7 @@ class TrainConfig:
 
     split: str = "18/4"
     """Seen/unseen target classes: 22/0, 18/4 or 14/8; or a comma-separated list of unseen classes:
-    Mug,Vase,CD,Towel."""
+    Mug,Vase,CD,Towel. open: the open-vocabulary benchmark, with targets of its own."""
     targets: str = "paper"
     """Classes to look for. paper: its 22, or those that the rooms of --data name themselves. all:
     every class that can be found in a training room, by room type. Or classes, separated by commas:
@@ -174,8 +175,10 @@ class TrainConfig:
                     wanted = "finite" if isinstance(value, float) else f"of type {kind}"
                     raise ValueError(f"--{name.replace('_', '-')} {value}: must be {wanted}")
         check_seed(self.seed)
+        if self.split == OPEN and self.targets != PAPER_TARGETS:
+            raise ValueError(f"--targets {self.targets}: --split {OPEN} has its own targets")
         split_name(self.split, known_classes(self.targets, self.data))
-        if self.targets == "paper" and self.data is None:
+        if self.targets == PAPER_TARGETS and self.data is None:
             make_split(self.split, self.validation)
         if self.model not in MODELS and "." not in self.model:
             known = ", ".join(MODELS)
@@ -202,6 +205,11 @@ class TrainConfig:
             data=absolute(self.data),
             word_vectors=absolute(self.word_vectors),
         )
+
+    @property
+    def sought(self) -> str:
+        """What `dataset.find_targets` is asked for: the targets, or the split that has its own."""
+        return OPEN if self.split == OPEN else self.targets
 
     @property
     def budget(self) -> dict[str, Any]:

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 from collections.abc import Collection, Iterable, Mapping
 from functools import cache
+from typing import Any
 
+from tdanet_jax.io import assets
 from tdanet_jax.labels import Labels
 from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TARGETS, class_words
 
@@ -58,12 +61,26 @@ VALIDATION_UNSEEN = {
 }
 
 
+#: The open-vocabulary benchmark: it has targets of its own.
+OPEN, OPEN_ASSET = "open", "open.json"
+#: The splits that have names.
+NAMED = (*UNSEEN, OPEN)
+
+
+@cache
+def open_classes() -> dict[str, Any]:
+    """The open benchmark's "targets" by room type, "unseen" classes, and those of "validation"."""
+    content = json.loads(assets.path(OPEN_ASSET).read_text(encoding="utf-8"))
+    targets = {room: tuple(names) for room, names in content["targets"].items()}
+    return {**content, "targets": targets}
+
+
 @dataclasses.dataclass(frozen=True)
 class Split:
     """Rooms and target classes for training, and for evaluation as seen and as unseen.
 
     Attributes:
-      name: "18/4", "Mug,Vase", or "18/4-validation".
+      name: "18/4", "Mug,Vase", "open", or "18/4-validation".
       train_scenes, eval_scenes: scene names such as "FloorPlan1".
       hidden: classes that training must know nothing of.
       seen: room type -> target classes of training.
@@ -76,6 +93,11 @@ class Split:
     hidden: frozenset[str]
     seen: dict[str, tuple[str, ...]]
     unseen: dict[str, tuple[str, ...]]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is the open-vocabulary benchmark, or its validation."""
+        return is_open(self.name)
 
     def within(self, scenes: Collection[str], classes: Collection[str]) -> Split:
         """The split restricted to these scenes and classes.
@@ -108,7 +130,7 @@ class Split:
 
 
 def make_split(
-    text: str, validation: bool = False, targets: Mapping[str, tuple[str, ...]] = TARGETS
+    text: str, validation: bool = False, targets: Mapping[str, tuple[str, ...]] | None = None
 ) -> Split:
     """The split with a name, or the custom one that leaves these classes out (see `split_name`).
 
@@ -116,11 +138,14 @@ def make_split(
     each type are for evaluation, and one of the seen classes of each type is held out as well.
 
     Args:
-      targets: room type -> target classes; `dataset.find_targets` makes them of `--targets`.
+      targets: room type -> target classes; `dataset.find_targets` makes them of `--targets`. None:
+        those of the paper, or of the open benchmark.
 
     Raises:
       ValueError: `text` is not a split, or leaves no class for training in some room type.
     """
+    if targets is None:
+        targets = open_classes()["targets"] if text == OPEN else TARGETS
     every = in_order(c for names in targets.values() for c in names)
     name = split_name(text, every)
     missing = unseen_classes(name)
@@ -131,7 +156,10 @@ def make_split(
         names = [f"FloorPlan{n}" for n in SCENE_NUMBERS[room]]
         train += names[:first]
         evaluated += names[first:last]
-    unseen = _held_out(targets, missing) if validation else missing
+    unseen = missing
+    if validation:
+        own = name == OPEN
+        unseen = tuple(open_classes()["validation"]) if own else _held_out(targets, missing)
     hidden = {*missing, *unseen}
     seen = {room: tuple(c for c in names if c not in hidden) for room, names in targets.items()}
     if empty := [room for room in ROOM_TYPES if targets.get(room) and not seen[room]]:
@@ -153,14 +181,14 @@ def split_name(text: str, targets: Collection[str] | None = ALL_TARGETS) -> str:
     """The canonical name of the split that `text` describes.
 
     Args:
-      text: "22/0", "18/4" or "14/8"; or the unseen classes in any order, separated by commas:
-        "vase,Mug" is "Mug,Vase", and the four classes of 18/4 are "18/4".
+      text: "22/0", "18/4", "14/8" or "open"; or the unseen classes in any order, separated by
+        commas: "vase,Mug" is "Mug,Vase", and the four classes of 18/4 are "18/4".
       targets: the classes that may be unseen; None: any, as long as the rooms are not known.
 
     Raises:
       ValueError: it describes none; the message says why.
     """
-    if text in UNSEEN:
+    if text in NAMED:
         return text
     named = [_target_class(word, text, targets) for word in text.split(",")]
     if twice := [name for name in named if named.count(name) > 1]:
@@ -175,7 +203,14 @@ def unseen_classes(name: str) -> tuple[str, ...]:
     """The classes that the split with this canonical name leaves out of training."""
     if name in UNSEEN:
         return tuple(c for room in ROOM_TYPES for c in UNSEEN[name][room])
+    if name == OPEN:
+        return tuple(open_classes()["unseen"])
     return tuple(name.split(","))
+
+
+def is_open(name: str) -> bool:
+    """Whether a split with this name is the open-vocabulary benchmark, or its validation."""
+    return name.removesuffix("-validation") == OPEN
 
 
 def in_order(classes: Iterable[str]) -> tuple[str, ...]:
@@ -217,7 +252,7 @@ def _target_class(word: str, text: str, targets: Collection[str] | None) -> str:
         )
     problem = "" if word == text else f"no target is called {word}; "
     raise ValueError(
-        f"--split {text}: {problem}choose one of {', '.join(UNSEEN)}, or name the unseen classes, "
+        f"--split {text}: {problem}choose one of {', '.join(NAMED)}, or name the unseen classes, "
         f"separated by commas, among {', '.join(targets)}"
     )
 
@@ -234,10 +269,11 @@ def is_plain(name: str) -> bool:
 
 
 def _held_out(targets: Mapping[str, tuple[str, ...]], missing: Collection[str]) -> tuple[str, ...]:
-    """The classes that validation holds out, one of each of iTHOR's room types if it has any left.
+    """The classes that validation holds out: one of each of iTHOR's room types.
 
-    In rooms of other types alone, one of each of those. A class that is the last of another room
-    type is held out only if there is no other.
+    In rooms of other types alone, one of each of those. It is a class without which every room type
+    still has one to train on. If there is none, nothing is held out in a room type that has all of
+    its targets; in another, its last one is, and `make_split` refuses the split.
     """
     held: list[str] = []
     rooms = [room for room in ROOM_TYPES if targets.get(room)] or [*targets]
@@ -250,5 +286,5 @@ def _held_out(targets: Mapping[str, tuple[str, ...]], missing: Collection[str]) 
             for c, hidden in zip(left, without, strict=True)
             if all(set(targets[other]) - hidden for other in rooms if targets[other])
         ]
-        held += (spared or left)[:1]
+        held += (spared or (left if {*missing} & {*targets[room]} else []))[:1]
     return tuple(held)

@@ -177,7 +177,7 @@ def make_task(
         model needs feature maps and there are none.
     """
     rooms = Rooms(tables, extras)
-    tables, targets = find_targets(config.targets, rooms, config.validation)
+    tables, targets = find_targets(config.sought, rooms, config.validation)
     split = make_split(config.split, config.validation, targets)
     split = assign_rooms(split, rooms, config.validation)
     split = split.within(tables.scenes, tables.classes)

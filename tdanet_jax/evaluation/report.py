@@ -23,7 +23,7 @@ from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.registry import SENSORS
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.splits import GROUPS, in_order
+from tdanet_jax.splits import GROUPS, in_order, is_open
 from tdanet_jax.targets import PAPER
 from tdanet_jax.task import Task
 from tdanet_jax.vocabulary import ACTION_NAMES
@@ -105,15 +105,22 @@ class Provenance:
             image=task.image if network else None,
             sensors=task.spec.sensors if network else (),
             departures=departures or None,
-            targets="data" if own else config.targets,
+            targets="data" if own else config.sought,
         )
 
 
-def columns(tables: SceneTables, episodes: Episodes, records: Records) -> Columns:
-    """Records as named columns of length E, with names instead of indices."""
+def columns(
+    tables: SceneTables, episodes: Episodes, records: Records, by_class: bool = False
+) -> Columns:
+    """Records as named columns of length E, with names instead of indices.
+
+    Args:
+      by_class: intervals resample target classes instead of (room, target) pairs.
+    """
     pose = tables.grid.split(episodes.pose)
     rotation, horizon = tables.grid.degrees(pose)
     scene = tables.position_scene[pose.position]
+    pair = scene.astype(np.int64) * len(tables.targets) + episodes.target
     return {
         "scene": np.array(tables.scenes)[scene],
         "room": np.array(tables.room_types)[tables.position_room_type[pose.position]],
@@ -125,7 +132,8 @@ def columns(tables: SceneTables, episodes: Episodes, records: Records) -> Column
         "shortest": records.shortest,
         "length": records.length,
         "success": records.success,
-        "cluster": scene.astype(np.int64) * len(tables.targets) + episodes.target,
+        "cluster": episodes.target.astype(np.int64) if by_class else pair,
+        "pair": pair,
     }
 
 
@@ -135,7 +143,11 @@ def _results(
     """The content of `results.json`."""
 
     def by(key: str, names: tuple[str, ...]) -> dict:
-        split = {group: grouped(c, key, names) for group, c in groups.items()}
+        pairs = {"cluster": "pair"} if key == "target" else {}  # one class cannot be resampled
+        split = {
+            group: grouped({n: c[pairs.get(n, n)] for n in c}, key, names)
+            for group, c in groups.items()
+        }
         found = (name for name in names if any(name in parts for parts in split.values()))
         return {
             name: {group: parts[name] for group, parts in split.items() if name in parts}
@@ -208,7 +220,8 @@ def results(
         None writes nothing.
     """
     folder = None if folder is None else Path(folder)
-    groups = {name: columns(tables, *pair) for name, pair in played.items()}
+    by_class = is_open(provenance.split)
+    groups = {name: columns(tables, *pair, by_class) for name, pair in played.items()}
     out = _results(provenance, groups, tables)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -247,7 +260,8 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
         *([f"Targets: {in_markdown(out['targets'])}."] if out["targets"] != PAPER else []),
         *(f"{n.capitalize()}: {in_markdown(out[n])}." for n in ("data", "image") if out[n]),
         "",
-        "SR and SPL in percent, with 95 % bootstrap intervals over (room, target) pairs.",
+        "SR and SPL in percent, with 95 % bootstrap intervals over "
+        f"{'target classes' if is_open(out['split']) else '(room, target) pairs'}.",
         "",
         *_header("Targets", "Agent"),
     ]

@@ -81,7 +81,8 @@ class Evaluated:
 
     def columns(self) -> dict[str, report.Columns]:
         """Its records by group, as named columns."""
-        return {name: report.columns(self.task.tables, *pair) for name, pair in self.played.items()}
+        tables, by_class = self.task.tables, self.task.split.is_open
+        return {name: report.columns(tables, *pair, by_class) for name, pair in self.played.items()}
 
 
 def find(

@@ -21,6 +21,7 @@ from tdanet_jax.scenes.tables import FIELDS, SceneTables
 from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.scenes.target_distances import with_targets
 from tdanet_jax.splits import (
+    OPEN,
     PARTS,
     TRAIN_SCENES_PER_TYPE,
     VALIDATION_TRAIN_SCENES_PER_TYPE,
@@ -28,6 +29,7 @@ from tdanet_jax.splits import (
     in_order,
     is_plain,
     make_split,
+    open_classes,
 )
 from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TARGETS
 
@@ -298,7 +300,7 @@ def find_targets(
     can be found in a training room of the type.
 
     Args:
-      text: `TrainConfig.targets`. "paper" is what the data say themselves, if they say it.
+      text: `TrainConfig.sought`. "paper" is what the data say themselves, if they say it.
       validation: as for `assign_rooms`.
 
     Raises:
@@ -313,7 +315,12 @@ def find_targets(
         return tables, TARGETS | {
             room: tuple(c for c in ALL_TARGETS if c in names) for room, names in held.items()
         }
-    if named:
+    if text == OPEN:
+        asked, named = open_classes()["targets"], False
+        asked = {
+            room: tuple(c for c in names if c in tables.classes) for room, names in asked.items()
+        }
+    elif named:
         asked = targets.parse(text)
     if unknown := [room for room in asked if room and room not in tables.room_types]:
         raise ValueError(
