@@ -59,9 +59,8 @@ def show(command: Command) -> None:
     devices.start()
     choice, runs = command.choice, [command.checkpoint]
     out = command.out or default_folder(command)
-    rooms = one_episode.load_rooms(choice, runs)
-    tables = rooms.tables
-    player = one_episode.load_players(choice, runs, rooms)[0]
+    player = one_episode.load_players(choice, runs, one_episode.load_rooms(choice, runs))[0]
+    tables = player.task.tables
     if not player.attends:
         fail(
             f"--checkpoint {command.checkpoint}: this model has no attention over the detections; "

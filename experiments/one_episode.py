@@ -91,22 +91,34 @@ def folder_of(run: Path) -> Path:
 
 
 def load_rooms(choice: Choice, runs: Sequence[Path]) -> Rooms:
-    """The rooms of --data or of the first run; shows progress if they are rebuilt."""
+    """The rooms of --data or of the first run, with --target among the targets if it is a class.
+
+    Shows progress if they are rebuilt.
+    """
+    from tdanet_jax.labels import Labels
     from tdanet_jax.scenes import dataset
+    from tdanet_jax.scenes.target_distances import with_targets
 
     run = folder_of(runs[0])
     files = EvalConfig(data=choice.data, word_vectors=choice.word_vectors)
     data = files.locate(configs.load(run / CONFIG_FILE), run).data
     with reporter("rooms", transient=True) as report:
-        return dataset.load_rooms(data, lambda done, total: report(done / total, "rebuilt"))
+        rooms = dataset.load_rooms(data, lambda done, total: report(done / total, "rebuilt"))
+    classes = rooms.tables.classes
+    sought = Labels(classes).find(choice.target) if choice.target else None
+    asked = [sought] if sought in classes else []
+    return dataclasses.replace(rooms, tables=with_targets(rooms.tables, asked))
 
 
 def load_players(choice: Choice, runs: Sequence[Path], rooms: Rooms) -> list[Player]:
-    """The agents of some runs, by different names."""
+    """The agents of some runs, by different names; each run's targets follow those before it."""
     from tdanet_jax.analysis import trace
 
     greedy, words = choice.policy == "greedy", choice.word_vectors
-    players = [trace.load_player(run, rooms, greedy, words) for run in runs]
+    players = []
+    for run in runs:
+        players.append(trace.load_player(run, rooms, greedy, words))
+        rooms = dataclasses.replace(rooms, tables=players[-1].task.tables)
     names = [player.name for player in players]
     return [
         player if names.count(player.name) == 1 else dataclasses.replace(player, name=str(run))
@@ -141,11 +153,11 @@ def play_runs(command: Comparison) -> tuple[list[Trace], SceneTables]:
     devices.keep_compiled()
     devices.start()
     choice, runs = command.choice, command.checkpoint
-    rooms = load_rooms(choice, runs)
-    players = load_players(choice, runs, rooms)
+    players = load_players(choice, runs, load_rooms(choice, runs))
+    tables = players[0].task.tables
     if command.shortest:
         players.append(trace.Player("shortest path", players[0].task))
-    return play(choice, runs, players, rooms.tables), rooms.tables
+    return play(choice, runs, players, tables), tables
 
 
 def print_outcomes(traces: Sequence[Trace], out: Path) -> None:

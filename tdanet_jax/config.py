@@ -14,7 +14,9 @@ from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import FileError, jsons, regular
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.registry import MODELS, SENSORS
-from tdanet_jax.splits import file_name, make_split, split_name
+from tdanet_jax.splits import OPEN, file_name, make_split, split_name
+from tdanet_jax.targets import PAPER as PAPER_TARGETS
+from tdanet_jax.targets import canonical, known_classes
 
 #: Environment steps of a run without a budget.
 DEFAULT_STEPS = 12_000_000
@@ -121,7 +123,11 @@ class TrainConfig:
 
     split: str = "18/4"
     """Seen/unseen target classes: 22/0, 18/4 or 14/8; or a comma-separated list of unseen classes:
-    Mug,Vase,CD,Towel."""
+    Mug,Vase,CD,Towel. open: the open-vocabulary benchmark, with targets of its own."""
+    targets: str = "paper"
+    """Classes to look for. paper: its 22, or those that the rooms of --data name themselves. all:
+    every class that can be found in a training room, by room type. Or classes, separated by commas:
+    Kettle,Mug,Book; for some room types: 'kitchen: Kettle, Mug; bedroom: Book, Pillow'."""
     model: str = "tdanet"
     """The model: tdanet, one of its ablations (tdanet-no-ta without target attention, tdanet-no-sa
     without the Siamese comparison, tdanet-no-ta-sa without either), ssnet, mjolnir-o, mjolnir-r
@@ -169,7 +175,11 @@ class TrainConfig:
                     wanted = "finite" if isinstance(value, float) else f"of type {kind}"
                     raise ValueError(f"--{name.replace('_', '-')} {value}: must be {wanted}")
         check_seed(self.seed)
-        make_split(self.split, self.validation)
+        if self.split == OPEN and self.targets != PAPER_TARGETS:
+            raise ValueError(f"--targets {self.targets}: --split {OPEN} has its own targets")
+        split_name(self.split, known_classes(self.targets, self.data))
+        if self.targets == PAPER_TARGETS and self.data is None:
+            make_split(self.split, self.validation)
         if self.model not in MODELS and "." not in self.model:
             known = ", ".join(MODELS)
             raise ValueError(f"--model {self.model}: choose one of {known}, or name a module")
@@ -190,10 +200,16 @@ class TrainConfig:
 
         return dataclasses.replace(
             self,
-            split=split_name(self.split),
+            split=split_name(self.split, None),
+            targets=canonical(self.targets),
             data=absolute(self.data),
             word_vectors=absolute(self.word_vectors),
         )
+
+    @property
+    def sought(self) -> str:
+        """What `dataset.find_targets` is asked for: the targets, or the split that has its own."""
+        return OPEN if self.split == OPEN else self.targets
 
     @property
     def budget(self) -> dict[str, Any]:

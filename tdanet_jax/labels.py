@@ -105,10 +105,14 @@ class Labels:
             if words := self._known_words(text):
                 return " ".join(words)
         lacking = ", ".join(word for word in class_words(first) if self._vector_words(word) is None)
-        near = dict.fromkeys(self._names[key] for key in self._near(_key(first), _SIMILAR))
+        near = self.near(first)
         problem = f"no word vector for {lacking}" if lacking else "has no words"
         question = f"; did you mean {' or '.join(near)}?" if near else ""
         raise LabelError(f"label {label!r}: {problem}{question}")
+
+    def near(self, label: str) -> list[str]:
+        """The most similar names that are known, the most similar first."""
+        return [*dict.fromkeys(self._names[key] for key in self._near(_key(label), _SIMILAR))]
 
     def same(self, label: str, other: str) -> bool:
         """Whether two labels mean the same, whether or not their words have vectors."""

@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Collection
+import json
+from collections.abc import Collection, Iterable, Mapping
+from functools import cache
+from typing import Any
 
-from tdanet_jax.labels import ai2thor_class
+from tdanet_jax.io import assets
+from tdanet_jax.labels import Labels
 from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TARGETS, class_words
 
 #: Scene numbers of each room type, in AI2-THOR's numbering; the first 20 train, the last 10 test.
@@ -57,12 +61,26 @@ VALIDATION_UNSEEN = {
 }
 
 
+#: The open-vocabulary benchmark: it has targets of its own.
+OPEN, OPEN_ASSET = "open", "open.json"
+#: The splits that have names.
+NAMED = (*UNSEEN, OPEN)
+
+
+@cache
+def open_classes() -> dict[str, Any]:
+    """The open benchmark's "targets" by room type, "unseen" classes, and those of "validation"."""
+    content = json.loads(assets.path(OPEN_ASSET).read_text(encoding="utf-8"))
+    targets = {room: tuple(names) for room, names in content["targets"].items()}
+    return {**content, "targets": targets}
+
+
 @dataclasses.dataclass(frozen=True)
 class Split:
     """Rooms and target classes for training, and for evaluation as seen and as unseen.
 
     Attributes:
-      name: "18/4", "Mug,Vase", or "18/4-validation".
+      name: "18/4", "Mug,Vase", "open", or "18/4-validation".
       train_scenes, eval_scenes: scene names such as "FloorPlan1".
       hidden: classes that training must know nothing of.
       seen: room type -> target classes of training.
@@ -75,6 +93,11 @@ class Split:
     hidden: frozenset[str]
     seen: dict[str, tuple[str, ...]]
     unseen: dict[str, tuple[str, ...]]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is the open-vocabulary benchmark, or its validation."""
+        return is_open(self.name)
 
     def within(self, scenes: Collection[str], classes: Collection[str]) -> Split:
         """The split restricted to these scenes and classes.
@@ -106,16 +129,25 @@ class Split:
         )
 
 
-def make_split(text: str, validation: bool = False) -> Split:
+def make_split(
+    text: str, validation: bool = False, targets: Mapping[str, tuple[str, ...]] | None = None
+) -> Split:
     """The split with a name, or the custom one that leaves these classes out (see `split_name`).
 
     With `validation`, neither test rooms nor unseen classes are used: the last 4 training rooms of
     each type are for evaluation, and one of the seen classes of each type is held out as well.
 
+    Args:
+      targets: room type -> target classes; `dataset.find_targets` makes them of `--targets`. None:
+        those of the paper, or of the open benchmark.
+
     Raises:
       ValueError: `text` is not a split, or leaves no class for training in some room type.
     """
-    name = split_name(text)
+    if targets is None:
+        targets = open_classes()["targets"] if text == OPEN else TARGETS
+    every = in_order(c for names in targets.values() for c in names)
+    name = split_name(text, every)
     missing = unseen_classes(name)
     first = VALIDATION_TRAIN_SCENES_PER_TYPE if validation else TRAIN_SCENES_PER_TYPE
     last = TRAIN_SCENES_PER_TYPE if validation else None
@@ -124,10 +156,13 @@ def make_split(text: str, validation: bool = False) -> Split:
         names = [f"FloorPlan{n}" for n in SCENE_NUMBERS[room]]
         train += names[:first]
         evaluated += names[first:last]
-    unseen = {r: _held_out(r, missing[r]) for r in ROOM_TYPES} if validation else missing
-    hidden = {c for room in ROOM_TYPES for c in (*missing[room], *unseen[room])}
-    seen = {room: tuple(c for c in TARGETS[room] if c not in hidden) for room in ROOM_TYPES}
-    if empty := [room for room in ROOM_TYPES if not seen[room]]:
+    unseen = missing
+    if validation:
+        own = name == OPEN
+        unseen = tuple(open_classes()["validation"]) if own else _held_out(targets, missing)
+    hidden = {*missing, *unseen}
+    seen = {room: tuple(c for c in names if c not in hidden) for room, names in targets.items()}
+    if empty := [room for room in ROOM_TYPES if targets.get(room) and not seen[room]]:
         besides = " besides the one that --validation holds out" if validation else ""
         raise ValueError(
             f"--split {text}: leaves no class to train on in {', '.join(empty)}{besides}"
@@ -138,37 +173,56 @@ def make_split(text: str, validation: bool = False) -> Split:
         eval_scenes=tuple(evaluated),
         hidden=frozenset(hidden),
         seen=seen,
-        unseen=dict(unseen),
+        unseen={room: tuple(c for c in unseen if c in names) for room, names in targets.items()},
     )
 
 
-def split_name(text: str) -> str:
+def split_name(text: str, targets: Collection[str] | None = ALL_TARGETS) -> str:
     """The canonical name of the split that `text` describes.
 
     Args:
-      text: "22/0", "18/4" or "14/8"; or the unseen classes in any order, separated by commas:
-        "vase,Mug" is "Mug,Vase", and the four classes of 18/4 are "18/4".
+      text: "22/0", "18/4", "14/8" or "open"; or the unseen classes in any order, separated by
+        commas: "vase,Mug" is "Mug,Vase", and the four classes of 18/4 are "18/4".
+      targets: the classes that may be unseen; None: any, as long as the rooms are not known.
 
     Raises:
       ValueError: it describes none; the message says why.
     """
-    if text in UNSEEN:
+    if text in NAMED:
         return text
-    named = [_target_class(word, text) for word in text.split(",")]
-    if twice := [name for name in ALL_TARGETS if named.count(name) > 1]:
+    named = [_target_class(word, text, targets) for word in text.split(",")]
+    if twice := [name for name in named if named.count(name) > 1]:
         raise ValueError(f"--split {text}: {twice[0]} is given twice")
-    for name, classes in UNSEEN.items():
-        if set(named) == {c for room in ROOM_TYPES for c in classes[room]}:
+    for name in UNSEEN:
+        if set(named) == {*unseen_classes(name)}:
             return name
-    return ",".join(name for name in ALL_TARGETS if name in named)
+    return ",".join(in_order(named))
 
 
-def unseen_classes(name: str) -> dict[str, tuple[str, ...]]:
-    """Room type -> classes that the split with this canonical name leaves out of training."""
+def unseen_classes(name: str) -> tuple[str, ...]:
+    """The classes that the split with this canonical name leaves out of training."""
     if name in UNSEEN:
-        return UNSEEN[name]
-    named = name.split(",")
-    return {room: tuple(c for c in TARGETS[room] if c in named) for room in ROOM_TYPES}
+        return tuple(c for room in ROOM_TYPES for c in UNSEEN[name][room])
+    if name == OPEN:
+        return tuple(open_classes()["unseen"])
+    return tuple(name.split(","))
+
+
+def is_open(name: str) -> bool:
+    """Whether a split with this name is the open-vocabulary benchmark, or its validation."""
+    return name.removesuffix("-validation") == OPEN
+
+
+def in_order(classes: Iterable[str]) -> tuple[str, ...]:
+    """The different classes among these: the paper's targets in its order, then the others."""
+    names = set(classes)
+    return (*(c for c in ALL_TARGETS if c in names), *sorted(names - {*ALL_TARGETS}))
+
+
+def known_type(name: str) -> str:
+    """iTHOR's room type that a name has the words of, as LivingRoom has; otherwise the name."""
+    same = (known for known in ROOM_TYPES if class_words(known) == class_words(name))
+    return next(same, name)
 
 
 def file_name(split: str) -> str:
@@ -176,12 +230,19 @@ def file_name(split: str) -> str:
     return split.replace("/", "-").replace(",", "-")
 
 
-def _target_class(word: str, text: str) -> str:
+def _target_class(word: str, text: str, targets: Collection[str] | None) -> str:
     """The target class that `word` means."""
-    name = ai2thor_class(word)
-    if name in ALL_TARGETS:
+    word = word.strip()
+    name = labels_of(tuple(targets or ())).find(word)
+    if targets is None:
+        if name is not None and name[0].isupper():
+            return name
+        if word and is_plain(word):
+            return word
+        targets = ALL_TARGETS
+    elif name is not None and name in targets:
         return name
-    keys = {"".join(class_words(name)): name for name in ALL_TARGETS}
+    keys = {"".join(class_words(name)): name for name in targets}
     key = "".join(class_words(word))
     if not key and "," in text:
         raise ValueError(f"--split {text}: a comma without a class on both sides")
@@ -191,12 +252,39 @@ def _target_class(word: str, text: str) -> str:
         )
     problem = "" if word == text else f"no target is called {word}; "
     raise ValueError(
-        f"--split {text}: {problem}choose one of {', '.join(UNSEEN)}, or name the unseen classes, "
-        f"separated by commas, among {', '.join(ALL_TARGETS)}"
+        f"--split {text}: {problem}choose one of {', '.join(NAMED)}, or name the unseen classes, "
+        f"separated by commas, among {', '.join(targets)}"
     )
 
 
-def _held_out(room: str, missing: Collection[str]) -> tuple[str, ...]:
-    """The class of a room type that validation holds out, if the split leaves any."""
-    order = (*VALIDATION_UNSEEN[room], *TARGETS[room])
-    return tuple(name for name in order if name not in missing)[:1]
+@cache
+def labels_of(classes: tuple[str, ...]) -> Labels:
+    """What labels mean among these classes."""
+    return Labels(classes)
+
+
+def is_plain(name: str) -> bool:
+    """Whether a class can be a target: targets are given in lists, and become names of files."""
+    return name.isprintable() and name == name.strip() and not set(name) & set(",;:/\\")
+
+
+def _held_out(targets: Mapping[str, tuple[str, ...]], missing: Collection[str]) -> tuple[str, ...]:
+    """The classes that validation holds out: one of each of iTHOR's room types.
+
+    In rooms of other types alone, one of each of those. It is a class without which every room type
+    still has one to train on. If there is none, nothing is held out in a room type that has all of
+    its targets; in another, its last one is, and `make_split` refuses the split.
+    """
+    held: list[str] = []
+    rooms = [room for room in ROOM_TYPES if targets.get(room)] or [*targets]
+    for room in rooms:
+        order = (*VALIDATION_UNSEEN.get(room, ()), *targets[room])
+        left = [c for c in order if c in targets[room] and c not in {*missing, *held}]
+        without = ({*missing, *held, c} for c in left)
+        spared = [
+            c
+            for c, hidden in zip(left, without, strict=True)
+            if all(set(targets[other]) - hidden for other in rooms if targets[other])
+        ]
+        held += (spared or (left if {*missing} & {*targets[room]} else []))[:1]
+    return tuple(held)

@@ -23,7 +23,7 @@ from tdanet_jax.models.classes import ClassVocabulary, make_vocabulary
 from tdanet_jax.models.factory import make_model, resolve_precision
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.poses import PoseGrid
-from tdanet_jax.scenes.dataset import Extras, Rooms, assign_rooms, load_rooms
+from tdanet_jax.scenes.dataset import Extras, Rooms, assign_rooms, find_targets, load_rooms
 from tdanet_jax.scenes.offline.features import features_path, load_features
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.tabulation import Progress
@@ -36,7 +36,7 @@ class Task:
     """What a run trains and is evaluated on.
 
     Attributes:
-      tables: all rooms.
+      tables: all rooms, with the distances to all targets.
       split: which rooms and classes train.
       classes: the vocabulary, and the part of it that training may know.
       model: the network.
@@ -176,8 +176,10 @@ def make_task(
       ValueError: there are no rooms to train or to evaluate in, a class has no word vector, or the
         model needs feature maps and there are none.
     """
-    split = make_split(config.split, config.validation)
-    split = assign_rooms(split, Rooms(tables, extras), config.validation)
+    rooms = Rooms(tables, extras)
+    tables, targets = find_targets(config.sought, rooms, config.validation)
+    split = make_split(config.split, config.validation, targets)
+    split = assign_rooms(split, rooms, config.validation)
     split = split.within(tables.scenes, tables.classes)
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
     adjacency = None if extras is None else extras.class_graph(tables.classes)

@@ -109,9 +109,13 @@ class WordVectors:
         return lacking
 
 
-def load_bundled() -> WordVectors:
-    """The bundled vectors: 50 wide, the most frequent words of GloVe 6B."""
-    with np.load(assets.path(ASSET), allow_pickle=False) as data:
+def load_bundled(path: Path | None = None) -> WordVectors:
+    """The bundled vectors: 50 wide, the most frequent words of GloVe 6B.
+
+    Args:
+      path: a file of them that `build_asset` wrote; by default the bundled one.
+    """
+    with np.load(path or assets.path(ASSET), allow_pickle=False) as data:
         words = bytes(data["words"]).decode("utf-8").split("\n")
         vectors = data["vectors"].astype(np.float32)
     return WordVectors({word: row for row, word in enumerate(words)}, vectors)

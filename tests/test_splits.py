@@ -145,7 +145,7 @@ def test_validation_of_a_custom_split_holds_out_one_more_class_per_room_type(
     [
         (
             "17/5",
-            "choose one of 22/0, 18/4, 14/8, or name the unseen classes, separated by commas,",
+            "choose one of 22/0, 18/4, 14/8, open, or name the unseen classes, separated by",
         ),
         ("", "choose one of 22/0"),
         ("18/4,Mug", "no target is called 18/4; choose one of 22/0"),
@@ -173,6 +173,16 @@ def test_validation_needs_a_class_to_hold_out_besides_one_to_train_on() -> None:
     assert make_split(text).seen["bathroom"] == TARGETS["bathroom"][:1]
     with pytest.raises(ValueError, match="in bathroom besides the one that --validation holds out"):
         make_split(text, validation=True)
+
+
+def test_validation_holds_out_what_no_room_type_needs() -> None:
+    targets = {"kitchen": ("Mug", "Book", "Kettle"), "living_room": ("Book",)}
+    for text, held in (("22/0", "Mug"), ("Kettle", "Mug"), ("Mug", "Kettle")):
+        split = make_split(text, True, targets)
+        assert split.unseen == {"kitchen": (held,), "living_room": ()}
+        assert split.seen["living_room"] == ("Book",)
+    shops = {"shop": ("Lathe", "Vase"), **dict.fromkeys(ROOM_TYPES, ())}
+    assert make_split("22/0", True, shops).unseen["shop"] == ("Lathe",)
 
 
 def test_targets_and_rooms_exist_in_the_bundled_scenes(ithor: SceneTables) -> None:

@@ -231,7 +231,7 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
         ]
         rows += (differing := list(_differences(own, names)))
         rows += _means(own, names)
-        published = {} if departures else paper.rates(split)
+        published = {} if departures else paper.rates(split, own[0].get("targets"))
         for agent, groups in published.items():
             rows.append(((f"{agent} (paper)", "", "", ""), groups))
         lines += ["", f"## Split {split}", ""]

@@ -9,12 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from tdanet_jax.io import assets
-from tdanet_jax.scenes.dataset import Extras, PublishedEpisode
+from tdanet_jax.scenes.dataset import Extras, PublishedEpisode, Rooms, find_targets
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.splits import GROUPS, UNSEEN, Split, make_split
+from tdanet_jax.splits import GROUPS, NAMED, OPEN, UNSEEN, Split, make_split
+from tdanet_jax.vocabulary import ALL_TARGETS
 
 ASSET = "episodes.npz"
 EPISODES_PER_ROOM_TYPE = 250
+#: Of the open benchmark, for each target of a room type, by group.
+EPISODES_PER_TARGET = {"seen": 10, "unseen": 40}
 #: Seed of the lists; they change only with the tables.
 LIST_SEED = 20240413
 
@@ -70,13 +73,45 @@ def draw(
     return Episodes(np.array(starts, np.int32), np.array(goals, np.int32))
 
 
+def draw_evenly(
+    tables: SceneTables,
+    scenes: Sequence[str],
+    targets: Mapping[str, Sequence[str]],
+    per_target: int,
+    seed: int,
+) -> Episodes:
+    """Draws as many episodes for each target of a room type, in turn in the rooms with it.
+
+    Starts are drawn as in `draw`; targets that can be found in none of the rooms are left out.
+    """
+    rng = np.random.default_rng(seed)
+    reachable = tables.reachable
+    starts, goals = [], []
+    for kind, room in enumerate(tables.room_types):
+        here = [tables.positions_in(tables.scenes.index(scene), kind) for scene in scenes]
+        for name in targets.get(room, ()):
+            goal = tables.targets.index(name)
+            found = [valid for p in here if (valid := p[reachable[p, goal]]).size]
+            for number in range(per_target if found else 0):
+                valid = found[number % len(found)]
+                position = valid[rng.integers(len(valid))]
+                starts.append(tables.grid.look_level(position, rng.integers(tables.grid.rotations)))
+                goals.append(goal)
+    return Episodes(np.array(starts, np.int32), np.array(goals, np.int32))
+
+
 def draw_split(tables: SceneTables, split: Split) -> dict[str, Episodes]:
     """The seen and the unseen list of a split; a split without unseen classes has none."""
     lists = {}
     for group, targets in zip(GROUPS, (split.seen, split.unseen), strict=True):
         if any(targets.values()):
             seed = LIST_SEED + GROUPS.index(group)
-            lists[group] = draw(tables, split.eval_scenes, targets, EPISODES_PER_ROOM_TYPE, seed)
+            what = tables, split.eval_scenes, targets
+            lists[group] = (
+                draw_evenly(*what, EPISODES_PER_TARGET[group], seed)
+                if split.is_open
+                else draw(*what, EPISODES_PER_ROOM_TYPE, seed)
+            )
     return lists
 
 
@@ -84,9 +119,14 @@ def build_asset(tables: SceneTables, out_dir: Path | str) -> Path:
     """Writes the lists of every published split, and of its validation, for these tables."""
     out_dir = Path(out_dir)
     arrays = {"data_version": np.frombuffer(tables.data_version.encode(), np.uint8)}
-    for name in UNSEEN:
+    for name in NAMED:
         for validation in (False, True):
             split = make_split(name, validation)
+            if split.is_open:
+                tables, targets = find_targets(OPEN, Rooms(tables, None), validation)
+                split = make_split(name, validation, targets)
+                version = np.frombuffer(tables.data_version.encode(), np.uint8)
+                arrays[f"{OPEN}/data_version"] = version
             for group, episodes in draw_split(tables, split).items():
                 arrays[f"{split.name}/{group}/pose"] = episodes.pose
                 arrays[f"{split.name}/{group}/target"] = episodes.target
@@ -146,14 +186,20 @@ def published(
 
 
 def _committed(tables: SceneTables, split: Split) -> dict[str, Episodes]:
-    """The stored lists of a published split; none of another."""
+    """The stored lists of a split that has a name, with its own targets; none of another."""
     with np.load(assets.path(ASSET), allow_pickle=False) as data:
-        version = bytes(data["data_version"]).decode()
-        if version != tables.data_version:
+        version = bytes(data[f"{OPEN}/data_version" if split.is_open else "data_version"]).decode()
+        if (split.is_open or tables.targets == ALL_TARGETS) and version != tables.data_version:
             raise ValueError(
                 f"{ASSET} belongs to scene tables {version}, these are {tables.data_version}: "
                 "reinstall tdanet_jax, or run `python -m experiments.scenes build`"
             )
+        if not split.is_open and not any(
+            _same_targets(split, make_split(name, validation))
+            for name in UNSEEN
+            for validation in (False, True)
+        ):
+            return {}
         return {
             group: Episodes(
                 data[f"{split.name}/{group}/pose"], data[f"{split.name}/{group}/target"]
@@ -161,3 +207,8 @@ def _committed(tables: SceneTables, split: Split) -> dict[str, Episodes]:
             for group in GROUPS
             if f"{split.name}/{group}/pose" in data
         }
+
+
+def _same_targets(one: Split, other: Split) -> bool:
+    """Whether two splits have one name, and seen and unseen targets in the same room types."""
+    return (one.name, one.seen, one.unseen) == (other.name, other.seen, other.unseen)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from tdanet_jax.io.escaping import in_markdown
+from tdanet_jax.targets import PAPER
 
 WORLDS_DIFFER = (
     "The worlds differ: the paper used AI2-THOR 1.0.1 and its own test episodes; these rooms are "
@@ -50,10 +51,16 @@ NAMES = {
 }
 
 
-def rates(split: str) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
-    """The paper's agents on a split: name -> group -> bucket -> measure."""
+def rates(
+    split: str, targets: str | None = PAPER
+) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
+    """The paper's agents on a split: name -> group -> bucket -> measure; none for other targets.
+
+    Args:
+      targets: of `results.json`; the first results have none.
+    """
     out: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
-    for rate in RATES:
+    for rate in RATES if targets in (None, PAPER) else ():
         if rate.split == split:
             groups = out.setdefault(rate.agent, {})
             groups.setdefault(rate.group, {})[rate.bucket] = {"SR": rate.sr, "SPL": rate.spl}

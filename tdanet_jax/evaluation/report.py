@@ -23,9 +23,10 @@ from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.registry import SENSORS
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.splits import GROUPS
+from tdanet_jax.splits import GROUPS, in_order, is_open
+from tdanet_jax.targets import PAPER
 from tdanet_jax.task import Task
-from tdanet_jax.vocabulary import ACTION_NAMES, ALL_TARGETS
+from tdanet_jax.vocabulary import ACTION_NAMES
 
 #: Episodes and what happened in them, by group ("seen", "unseen").
 Played = Mapping[str, tuple[Episodes, Records]]
@@ -65,6 +66,7 @@ class Provenance:
     image: str | None = None  # the image that the model is shown, if there is one
     sensors: tuple[str, ...] = ()  # names of the agent's sensors; the paper's agents have none
     departures: Mapping[str, Any] | None = None  # from the official test, if there are any
+    targets: str = PAPER  # `TrainConfig.targets`, or "data" if the rooms name their own
 
     @classmethod
     def of(
@@ -89,6 +91,7 @@ class Provenance:
           departures: from the official test (`EvalConfig.departures`).
         """
         network = policy in ("sample", "greedy")
+        own = config.targets == PAPER and task.extras is not None and task.extras.targets
         return cls(
             split=task.split.name,
             model=config.model if network else policy,
@@ -102,14 +105,22 @@ class Provenance:
             image=task.image if network else None,
             sensors=task.spec.sensors if network else (),
             departures=departures or None,
+            targets="data" if own else config.sought,
         )
 
 
-def columns(tables: SceneTables, episodes: Episodes, records: Records) -> Columns:
-    """Records as named columns of length E, with names instead of indices."""
+def columns(
+    tables: SceneTables, episodes: Episodes, records: Records, by_class: bool = False
+) -> Columns:
+    """Records as named columns of length E, with names instead of indices.
+
+    Args:
+      by_class: intervals resample target classes instead of (room, target) pairs.
+    """
     pose = tables.grid.split(episodes.pose)
     rotation, horizon = tables.grid.degrees(pose)
     scene = tables.position_scene[pose.position]
+    pair = scene.astype(np.int64) * len(tables.targets) + episodes.target
     return {
         "scene": np.array(tables.scenes)[scene],
         "room": np.array(tables.room_types)[tables.position_room_type[pose.position]],
@@ -121,17 +132,22 @@ def columns(tables: SceneTables, episodes: Episodes, records: Records) -> Column
         "shortest": records.shortest,
         "length": records.length,
         "success": records.success,
-        "cluster": scene.astype(np.int64) * len(tables.targets) + episodes.target,
+        "cluster": episodes.target.astype(np.int64) if by_class else pair,
+        "pair": pair,
     }
 
 
 def _results(
-    provenance: Provenance, groups: Mapping[str, Columns], room_types: tuple[str, ...]
+    provenance: Provenance, groups: Mapping[str, Columns], tables: SceneTables
 ) -> dict[str, Any]:
     """The content of `results.json`."""
 
     def by(key: str, names: tuple[str, ...]) -> dict:
-        split = {group: grouped(c, key, names) for group, c in groups.items()}
+        pairs = {"cluster": "pair"} if key == "target" else {}  # one class cannot be resampled
+        split = {
+            group: grouped({n: c[pairs.get(n, n)] for n in c}, key, names)
+            for group, c in groups.items()
+        }
         found = (name for name in names if any(name in parts for parts in split.values()))
         return {
             name: {group: parts[name] for group, parts in split.items() if name in parts}
@@ -145,8 +161,8 @@ def _results(
         "version": RESULTS_VERSION,
         **{name: origin.pop(name) for name in _HEAD},
         **{name: _summary(groups[name]) if name in groups else None for name in GROUPS},
-        "by_room": by("room", room_types),
-        "by_target": by("target", ALL_TARGETS),
+        "by_room": by("room", tables.room_types),
+        "by_target": by("target", in_order(tables.targets)),
         **origin,
         "commit": code_version(),
     }
@@ -204,8 +220,9 @@ def results(
         None writes nothing.
     """
     folder = None if folder is None else Path(folder)
-    groups = {name: columns(tables, *pair) for name, pair in played.items()}
-    out = _results(provenance, groups, tables.room_types)
+    by_class = is_open(provenance.split)
+    groups = {name: columns(tables, *pair, by_class) for name, pair in played.items()}
+    out = _results(provenance, groups, tables)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         write_rows(folder, all_rows(tables, played))
@@ -232,17 +249,19 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
     """`results.md`: tables as in the paper, with the paper's rows next to ours."""
     agent = ObservationSpec(sensors=tuple(out["sensors"])).agent_name(out["model"])
     departures = out.get("departures")
-    published = {} if departures else paper.rates(out["split"])
+    published = {} if departures else paper.rates(out["split"], out["targets"])
     lines = [
-        f"# {in_markdown(agent)}, split {out['split']}, seed {out['seed']}",
+        f"# {in_markdown(agent)}, split {in_markdown(out['split'])}, seed {out['seed']}",
         "",
         f"{out['episodes_trained']:,} training episodes, {out['steps']:,} environment steps; "
         f"{out['policy']} actions, evaluation seed {out['evaluation_seed']}; scene tables "
         f"{out['data_version']}, code {out['commit']}.",
         *(["", f"**{in_markdown(describe_departures(departures))}.**", ""] if departures else []),
+        *([f"Targets: {in_markdown(out['targets'])}."] if out["targets"] != PAPER else []),
         *(f"{n.capitalize()}: {in_markdown(out[n])}." for n in ("data", "image") if out[n]),
         "",
-        "SR and SPL in percent, with 95 % bootstrap intervals over (room, target) pairs.",
+        "SR and SPL in percent, with 95 % bootstrap intervals over "
+        f"{'target classes' if is_open(out['split']) else '(room, target) pairs'}.",
         "",
         *_header("Targets", "Agent"),
     ]
@@ -255,7 +274,8 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
                 lines.append(_row((group, f"{name} (paper)"), theirs[group]))
     if published:
         lines += ["", paper.worlds(out["data"])]
-    if "unseen" in groups and (apart := _near_synonyms(groups["unseen"])):
+    paired = out["targets"] == PAPER and "unseen" in groups
+    if paired and (apart := _near_synonyms(groups["unseen"])):
         known = "; ".join(
             f"{name}: {', '.join(like)}"
             for name, like in NEAR_SYNONYMS.items()

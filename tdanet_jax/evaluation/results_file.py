@@ -38,13 +38,14 @@ def check(path: Path, results: Any) -> None:
         if number(path, results.get(name), name, most) < 0 or type(results[name]) is not int:
             raise FileError(path, f"{name} is not a count")
     try:
-        canonical = split_name(results["split"])
+        canonical = split_name(results["split"], None)
     except ValueError as error:
         raise FileError(path, error) from None
     if canonical != results["split"]:  # it becomes part of the names of pictures
         raise FileError(path, f"split {results['split']}: not the name of a split")
-    if not isinstance(results.get("data"), str | None):
-        raise FileError(path, "data is not text")
+    for name in ("data", "targets"):
+        if not isinstance(results.get(name), str | None):
+            raise FileError(path, f"{name} is not text")
     _check_groups(path, results, "")
     if results.get("seen") is None:
         raise FileError(path, "not the results of a run (no results for seen targets)")

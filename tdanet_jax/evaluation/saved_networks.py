@@ -81,7 +81,8 @@ class Evaluated:
 
     def columns(self) -> dict[str, report.Columns]:
         """Its records by group, as named columns."""
-        return {name: report.columns(self.task.tables, *pair) for name, pair in self.played.items()}
+        tables, by_class = self.task.tables, self.task.split.is_open
+        return {name: report.columns(tables, *pair, by_class) for name, pair in self.played.items()}
 
 
 def find(
@@ -203,7 +204,7 @@ def _task_config(network: SavedNetwork) -> TrainConfig:
 
     Runs of one task thus compare equal.
     """
-    kept = ("split", "model", "validation", "network", "data", "word_vectors")
+    kept = ("split", "targets", "model", "validation", "network", "data", "word_vectors")
     located = network.located
     values: dict[str, Any] = {name: getattr(located, name) for name in kept}
     if located.word_vectors is not None:  # every run has a copy of its own

@@ -1,7 +1,8 @@
 """The cache of the bundled rooms' tables, which are computed once per machine.
 
 The name of a cached file contains a hash of everything that determines it: the bundled rooms and
-the source of the modules that compute the tables. Files are written atomically, and if several
+the source of the modules that compute the tables; or tables and further targets
+(`target_distances`). Files are written atomically, and if several
 processes need the tables at the same time, one computes them while the others wait.
 """
 
@@ -17,11 +18,14 @@ import shutil
 import tempfile
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import platformdirs
 
-from tdanet_jax.io import assets, files
+from tdanet_jax.io import archive, assets, files
+from tdanet_jax.io.untrusted import npz
 from tdanet_jax.scenes import ithor, tabulation
 from tdanet_jax.scenes.tables import SceneTables
 
@@ -30,6 +34,8 @@ VARIABLE = "TDANET_CACHE"
 UNUSED_DAYS = 30
 #: Prefixes of tables, and of the folders in which an import keeps the scenes that it has read.
 TABLES, IMPORTS = "ithor-", "import-"
+#: Prefix of distances to targets that tables do not have (`target_distances`).
+DISTANCES = "distances-"
 _MODULES = (
     "io.archive",
     "poses",
@@ -84,7 +90,22 @@ def load_tables(progress: tabulation.Progress | None = None) -> SceneTables:
 
     Warns if a cached file is damaged, which is then replaced, and if the cache cannot be written.
     """
-    path = folder() / f"{TABLES}{key()}.npz"
+
+    def compute() -> dict[str, np.ndarray]:
+        return tabulation.build(ithor.load_scenes(), progress=progress).to_arrays()
+
+    return SceneTables.from_arrays(load(f"{TABLES}{key()}.npz", compute))
+
+
+def load(name: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The arrays of a file of the cache, or computed and then cached.
+
+    Args:
+      name: of the file; it contains a hash of everything that determines the arrays.
+
+    Warns as `load_tables` does.
+    """
+    path = folder() / name
     if (found := _read(path)) is not None:
         return found
     with contextlib.ExitStack() as stack:
@@ -92,13 +113,13 @@ def load_tables(progress: tabulation.Progress | None = None) -> SceneTables:
         if (found := _read(path)) is not None:
             return found
         if path.exists():
-            warnings.warn(f"{path}: damaged, computed again", stacklevel=2)
-        result = tabulation.build(ithor.load_scenes(), progress=progress)
+            warnings.warn(f"{path}: damaged, computed again", stacklevel=3)
+        result = compute()
         try:
             _store(result, path)
             _remove_unused(path.parent)
         except OSError as error:
-            warnings.warn(f"{path}: not cached ({error.strerror})", stacklevel=2)
+            warnings.warn(f"{path}: not cached ({error.strerror})", stacklevel=3)
     return result
 
 
@@ -114,12 +135,12 @@ def _lock(stack: contextlib.ExitStack) -> None:
     files.remove_partial(folder())
 
 
-def _read(path: Path) -> SceneTables | None:
-    """The cached tables, or None if they are missing or their checksum is wrong."""
+def _read(path: Path) -> dict[str, np.ndarray] | None:
+    """The cached arrays, or None if they are missing or their checksum is wrong."""
     try:
         if path.with_suffix(".sha256").read_text(errors="replace").strip() == assets.sha256(path):
             touch(path)
-            return SceneTables.load(path)
+            return npz.read(path)
     except OSError:
         pass
     return None
@@ -132,12 +153,13 @@ def touch(path: Path) -> None:
 
 
 def _remove_unused(place: Path) -> None:
-    """Removes tables and scenes of imports that have not been used for long; holds the lock.
+    """Removes tables, distances and scenes of imports that have long been unused; holds the lock.
 
     A process that reads them has them open, or computes again what it does not find.
     """
     oldest = time.time() - UNUSED_DAYS * 86400
-    for path in [*place.glob(f"{TABLES}*.npz"), *place.glob(f"{IMPORTS}*")]:
+    kinds = (f"{TABLES}*.npz", f"{DISTANCES}*.npz", f"{IMPORTS}*")
+    for path in [path for kind in kinds for path in place.glob(kind)]:
         with contextlib.suppress(OSError):
             if path.stat().st_mtime >= oldest:
                 continue
@@ -148,7 +170,7 @@ def _remove_unused(place: Path) -> None:
                 path.with_suffix(".sha256").unlink()
 
 
-def _store(result: SceneTables, path: Path) -> None:
+def _store(result: dict[str, np.ndarray], path: Path) -> None:
     with files.replacing(path) as temporary:
-        result.save(temporary)
+        archive.write(temporary, result, compress=True)
         files.write_text(path.with_suffix(".sha256"), assets.sha256(temporary) + "\n")

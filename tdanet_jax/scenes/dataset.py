@@ -10,16 +10,28 @@ from typing import Any
 
 import numpy as np
 
+from tdanet_jax import targets
 from tdanet_jax.io import archive, files
 from tdanet_jax.io.untrusted import FileError, jsons, npz
 from tdanet_jax.scenes import cache, metadata, tabulation
 from tdanet_jax.scenes.metadata import FARTHEST
 from tdanet_jax.scenes.room_names import Kinds, check_name
-from tdanet_jax.scenes.scene import MOST_CLASSES, MOST_ROOM_TYPES, SceneError
+from tdanet_jax.scenes.scene import MOST_CLASSES, MOST_ROOM_TYPES, Scene, SceneError
 from tdanet_jax.scenes.tables import FIELDS, SceneTables
 from tdanet_jax.scenes.tabulation import Progress
-from tdanet_jax.splits import PARTS, TRAIN_SCENES_PER_TYPE, VALIDATION_TRAIN_SCENES_PER_TYPE, Split
-from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES
+from tdanet_jax.scenes.target_distances import with_targets
+from tdanet_jax.splits import (
+    OPEN,
+    PARTS,
+    TRAIN_SCENES_PER_TYPE,
+    VALIDATION_TRAIN_SCENES_PER_TYPE,
+    Split,
+    in_order,
+    is_plain,
+    make_split,
+    open_classes,
+)
+from tdanet_jax.vocabulary import ALL_TARGETS, ROOM_TYPES, TARGETS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +57,7 @@ class Extras:
       graph_classes: n class names, one for each row of `adjacency`.
       adjacency: [n, n] float32, the published class graph; [0, 0] without one.
       parts: room -> "train" or "test", for rooms whose scene file says it.
+      targets: room type -> target classes, if the data say which they are.
     """
 
     parents: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(
@@ -54,6 +67,7 @@ class Extras:
     graph_classes: tuple[str, ...] = ()
     adjacency: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0), np.float32))
     parts: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    targets: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
     def class_graph(self, classes: Sequence[str]) -> np.ndarray | None:
         """The class graph between `classes`: [C, C] float32, or None without one.
@@ -98,7 +112,7 @@ def load_rooms(path: str | Path | None, progress: Progress | None = None) -> Roo
         tables = SceneTables.from_arrays(arrays)
         if problem := _find_problem(tables):
             raise ValueError(problem)
-        return Rooms(tables.with_known_targets(), _read_extras(arrays), path)
+        return Rooms(tables.with_known_targets(), _read_extras(arrays, tables), path)
     except Exception as error:  # a missing array, a field of another type, broken JSON
         raise FileError(path, f"not a file of rooms ({error})") from None
 
@@ -124,7 +138,20 @@ def build_rooms(
         tables = tabulation.build(scenes, progress=progress)
     except SceneError as error:
         raise SceneError(f"{scene_file}: {error}") from None
-    return Rooms(tables, Extras(parts={s.name: s.part for s in scenes if s.part is not None}))
+    for scene in scenes:
+        if lacking := sorted({*scene.targets} - {*tables.classes}):
+            raise SceneError(f"{scene_file}: {scene.name}: targets: no room holds a {lacking[0]}")
+    parts = {s.name: s.part for s in scenes if s.part is not None}
+    return Rooms(tables, Extras(parts=parts, targets=_own_targets(scenes)))
+
+
+def _own_targets(scenes: Sequence[Scene]) -> dict[str, tuple[str, ...]]:
+    """Room type -> the targets that scenes with such rooms name; empty if none does."""
+    named = {
+        room: in_order(c for s in scenes if room in s.point_types for c in s.targets)
+        for room in sorted({room for scene in scenes for room in scene.point_types})
+    }
+    return {room: names for room, names in named.items() if names}
 
 
 def save_rooms(rooms: Rooms, path: Path | str) -> None:
@@ -136,6 +163,7 @@ def save_rooms(rooms: Rooms, path: Path | str) -> None:
         "episodes": [dataclasses.astuple(episode) for episode in extras.episodes],
         "graph_classes": extras.graph_classes,
         "parts": extras.parts,
+        "targets": extras.targets,
     }
     arrays = rooms.tables.to_arrays()
     arrays["extras/notes"] = np.frombuffer(json.dumps(notes).encode(), np.uint8)
@@ -195,7 +223,7 @@ def _find_problem(tables: SceneTables) -> str | None:
     return None
 
 
-def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
+def _read_extras(arrays: Mapping[str, np.ndarray], tables: SceneTables) -> Extras:
     if "extras/notes" not in arrays:
         return Extras()
     notes = jsons.parse("extras/notes", arrays["extras/notes"].tobytes().decode())
@@ -209,6 +237,9 @@ def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
     parts = notes.get("parts", {})  # older files have none
     if not set(parts.values()) <= set(PARTS):
         raise ValueError(f"a room whose part is neither of {', '.join(PARTS)}")
+    own = {room: tuple(names) for room, names in notes.get("targets", {}).items()}
+    if not {*own} <= {*tables.room_types} or not {*sum(own.values(), ())} <= {*tables.classes}:
+        raise ValueError("targets of a room type or of a class that it does not hold")
     return Extras(
         parents={
             ROOM_TYPES[ROOM_TYPES.index(room)]: {
@@ -224,6 +255,7 @@ def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
         graph_classes=names,
         adjacency=adjacency,
         parts=parts,
+        targets=own,
     )
 
 
@@ -238,22 +270,14 @@ def _read_episode(values: Sequence[Any]) -> PublishedEpisode:
 def assign_rooms(split: Split, rooms: Rooms, validation: bool = False) -> Split:
     """The split, with the rooms for which the data say "train" or "test" in that part.
 
-    The targets in a room type of the data's own are those target classes that its rooms hold, or
-    houses with such a room, seen and unseen as in the split. All other rooms stay where the split
-    has them by name. With `validation`, rooms for which the data say "test" are left out, and of
-    those of a room type that say "train" the last fifth is for evaluation, as with iTHOR's rooms.
-    Houses with rooms of several types are divided in the same way.
+    All other rooms stay where the split has them by name. With `validation`, rooms for which the
+    data say "test" are left out, and of those of a room type that say "train" the last fifth is for
+    evaluation, as with iTHOR's rooms. Houses with rooms of several types are divided in the same
+    way.
     """
     tables, parts = rooms.tables, {} if rooms.extras is None else rooms.extras.parts
     train = [name for name in split.train_scenes if name not in parts]
     evaluated = [name for name in split.eval_scenes if name not in parts]
-    seen, unseen = dict(split.seen), dict(split.unseen)
-    left_out = {name for names in split.unseen.values() for name in names}
-    for kind, room in enumerate(tables.room_types):
-        if room not in ROOM_TYPES:
-            held = [name for name in ALL_TARGETS if name in _classes_in(tables, kind)]
-            seen[room] = tuple(name for name in held if name not in split.hidden)
-            unseen[room] = tuple(name for name in held if name in left_out)
     for kind in (*range(len(tables.room_types)), -1):
         own = [n for n, k in zip(tables.scenes, tables.room_type, strict=True) if k == kind]
         mine = [name for name in own if parts.get(name) == "train"]
@@ -263,13 +287,91 @@ def assign_rooms(split: Split, rooms: Rooms, validation: bool = False) -> Split:
             mine, rest = mine[:first], mine[first:]
         train += mine
         evaluated += rest
-    return dataclasses.replace(
-        split,
-        train_scenes=tuple(train),
-        eval_scenes=tuple(evaluated),
-        seen=seen,
-        unseen=unseen,
-    )
+    return dataclasses.replace(split, train_scenes=tuple(train), eval_scenes=tuple(evaluated))
+
+
+def find_targets(
+    text: str, rooms: Rooms, validation: bool = False
+) -> tuple[SceneTables, dict[str, tuple[str, ...]]]:
+    """The tables with the targets that `--targets` asks for, and these targets by room type.
+
+    Those of the paper are as it has them; in a room type of the data's own, they are those that its
+    rooms hold, or houses with such a room. All others are those classes among the given ones that
+    can be found in a training room of the type.
+
+    Args:
+      text: `TrainConfig.sought`. "paper" is what the data say themselves, if they say it.
+      validation: as for `assign_rooms`.
+
+    Raises:
+      ValueError: a name means no class, or one that can be found in no training room (of the room
+        type, if one is given).
+    """
+    tables, named = rooms.tables, text != targets.PAPER
+    asked = {} if rooms.extras is None else dict(rooms.extras.targets)
+    if not named and not asked:
+        others = enumerate(tables.room_types[len(ROOM_TYPES) :], len(ROOM_TYPES))
+        held = {room: _classes_in(tables, kind) for kind, room in others}
+        return tables, TARGETS | {
+            room: tuple(c for c in ALL_TARGETS if c in names) for room, names in held.items()
+        }
+    if text == OPEN:
+        asked, named = open_classes()["targets"], False
+        asked = {
+            room: tuple(c for c in names if c in tables.classes) for room, names in asked.items()
+        }
+    elif named:
+        asked = targets.parse(text)
+    if unknown := [room for room in asked if room and room not in tables.room_types]:
+        raise ValueError(
+            f"--targets {unknown[0]}: no room type of these rooms; there are "
+            f"{', '.join(tables.room_types)}"
+        )
+    every = {name for name in tables.classes if is_plain(name)}
+    meant = {
+        label: targets.find(label, tables.classes) for names in asked.values() for label in names
+    }
+    wanted = {label: every if name is None else {name} for label, name in meant.items()}
+    tables = with_targets(tables, in_order(name for names in wanted.values() for name in names))
+    found = _found(tables, assign_rooms(make_split("22/0", validation), rooms, validation))
+    chosen: dict[str, set[str]] = {room: set() for room in tables.room_types}
+    for where, label in ((where, label) for where, names in asked.items() for label in names):
+        there = {room: wanted[label] & found[room] for room in ([where] if where else found)}
+        if named and not any(there.values()):
+            of = f" of type {where}" if where else ""
+            raise ValueError(f"--targets {label}: can be found in no training room{of}")
+        for room, names in there.items():
+            chosen[room] |= names
+    return tables, {room: in_order(names) for room, names in chosen.items()}
+
+
+def _found(tables: SceneTables, split: Split) -> dict[str, set[str]]:
+    """Room type -> the tables' targets that can be found in a training room of the type."""
+    trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]
+    reachable, names = tables.reachable, np.array(tables.targets, object)
+    return {
+        room: {*names[reachable[trains & (tables.position_room_type == kind)].any(axis=0)]}
+        for kind, room in enumerate(tables.room_types)
+    }
+
+
+def idle_rooms(tables: SceneTables, split: Split) -> list[str]:
+    """The rooms of a split in which none of its targets can be found: no episode is there."""
+    idle = set()
+    for scenes, sought in (
+        (split.train_scenes, [split.seen]),
+        (split.eval_scenes, [split.seen, split.unseen]),
+    ):
+        for name in scenes:
+            scene = tables.scenes.index(name)
+            if not any(
+                tables.reachable[tables.positions_in(scene, kind)][:, tables.targets.index(c)].any()
+                for kind, room in enumerate(tables.room_types)
+                for names in sought
+                for c in names.get(room, ())
+            ):
+                idle.add(name)
+    return [name for name in tables.scenes if name in idle]
 
 
 def _classes_in(tables: SceneTables, room_type: int) -> set[str]:

@@ -14,6 +14,8 @@ A scene file is JSON: a scene or a list of scenes, each an object with
     horizons             optional, degrees that the camera can look down, [0, 30] by default
     split                optional, train or test: the part of every split that the room belongs to;
                          without it the flags of `import` decide, or the name
+    targets              optional, names of classes: the targets in all rooms of the scene's type,
+                         with those of the file's other scenes of the type, in place of the paper's
     agent                optional, metadata["agent"] in the same frame, to verify the flags
 
 The grid, that is gridSize, rotateStepDegrees and horizons, is the same for all scenes of a file.
@@ -40,8 +42,9 @@ from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.labels import ai2thor_class
 from tdanet_jax.poses import ITHOR, TURNS, PoseGrid
 from tdanet_jax.scenes import house
-from tdanet_jax.scenes.room_names import Kinds, RoomKind, check_kind, check_name, known_type
+from tdanet_jax.scenes.room_names import Kinds, RoomKind, check_kind, check_name
 from tdanet_jax.scenes.scene import MOST_OBJECTS, MOST_POINTS, Scene, SceneError, SceneObject
+from tdanet_jax.splits import in_order, is_plain, known_type
 from tdanet_jax.vocabulary import IGNORED
 
 ALIGNED = 0.02  # metres by which a point may miss the grid
@@ -248,7 +251,15 @@ def _read_scene(document: Any, kinds: Kinds) -> Scene:
     if rooms:
         types = house.types_at(scene.points[:, [0, 2]], rooms)
         scene = dataclasses.replace(scene, room_type=types)
-    return dataclasses.replace(scene, part=part)
+    return dataclasses.replace(scene, part=part, targets=_targets(name, document))
+
+
+def _targets(scene: str, document: Mapping[str, Any]) -> tuple[str, ...]:
+    """The classes that a scene names as targets."""
+    names = document.get("targets", [])
+    if not isinstance(names, list) or not all(isinstance(n, str) and is_plain(n) for n in names):
+        raise SceneError(f"{scene}: targets is not a list of names of classes")
+    return in_order(map(_known, names))
 
 
 def _rooms(scene: str, document: Mapping[str, Any]) -> list[house.Room]:

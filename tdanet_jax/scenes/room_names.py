@@ -12,8 +12,14 @@ from typing import NamedTuple
 from tdanet_jax.io.escaping import in_name
 from tdanet_jax.io.untrusted import FileError, regular
 from tdanet_jax.scenes.scene import SceneError
-from tdanet_jax.splits import ITHOR_ROOMS, PARTS, SCENE_NUMBERS, TRAIN_SCENES_PER_TYPE
-from tdanet_jax.vocabulary import ROOM_TYPES, class_words
+from tdanet_jax.splits import (
+    ITHOR_ROOMS,
+    PARTS,
+    SCENE_NUMBERS,
+    TRAIN_SCENES_PER_TYPE,
+    known_type,
+)
+from tdanet_jax.vocabulary import ROOM_TYPES
 
 #: Bytes of UTF-8: names of rooms become names of files.
 LONGEST_NAME = 200
@@ -62,12 +68,6 @@ def check_kind(kind: RoomKind) -> None:
             raise SceneError(f"room_type {room_type!r}: did you mean {known}?")
     if part not in (None, *PARTS):
         raise SceneError(f"part {part!r}, not {' or '.join(PARTS)}")
-
-
-def known_type(name: str) -> str:
-    """iTHOR's room type that a name has the words of, as LivingRoom has; otherwise the name."""
-    same = (known for known in ROOM_TYPES if class_words(known) == class_words(name))
-    return next(same, name)
 
 
 def kind_of(name: str) -> RoomKind | None:

@@ -53,6 +53,7 @@ class Scene:
     default_position: np.ndarray | None = None  # [3] float64, agent in the metadata's frame
     default_rotation: int | None = None  # degrees clockwise from +z, horizon 0
     part: str | None = None  # "train" or "test" in every split; None if the name decides
+    targets: tuple[str, ...] = ()  # classes to look for in rooms of its types, if the scene says it
     grid: PoseGrid = ITHOR
 
     @property

@@ -14,6 +14,7 @@ from tdanet_jax import labels, words
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.io import assets, files
 from tdanet_jax.scenes import ithor, tabulation
+from tdanet_jax.tools import open_split
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,10 +120,11 @@ def _build(out_dir: Path, wheels: Path) -> list[Path]:
     tables = tabulation.build(ithor.load_scenes(rooms))
     synonyms = labels.build_asset(out_dir)
     vectors = words.build_asset(glove, out_dir, [*tables.classes, *labels.names_in(synonyms)])
-    lists = episodes.build_asset(tables, out_dir)
+    benchmark = open_split.build_asset(tables, words.load_bundled(vectors), out_dir)
+    lists = episodes.build_asset(tables, out_dir)  # of the installed benchmark: tests compare both
     notice = out_dir / "NOTICE"
     notice.write_text(notice_text(wheels), encoding="utf-8")
-    made = [rooms, synonyms, vectors, lists, notice]
+    made = [rooms, synonyms, vectors, benchmark, lists, notice]
     assets.record(out_dir, [path.name for path in made])
     return [*made, out_dir / assets.CHECKSUMS]
 

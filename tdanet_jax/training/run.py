@@ -14,6 +14,7 @@ from jax.sharding import Mesh
 
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.env.types import EnvParams
+from tdanet_jax.targets import PAPER
 from tdanet_jax.task import Task
 from tdanet_jax.training import devices, history, learner
 from tdanet_jax.training.checkpoint import Checkpoints
@@ -59,7 +60,8 @@ class Run:
     def title(self) -> str:
         """tdanet, split 18/4, seed 0; or tdanet, --odometry, ..."""
         name = self.task.spec.agent_name(self.config.model)
-        return f"{name}, split {self.task.split.name}, seed {self.config.seed}"
+        asked = "" if self.config.targets == PAPER else f", targets {self.config.targets}"
+        return f"{name}, split {self.task.split.name}{asked}, seed {self.config.seed}"
 
     def _init(self, key: jax.Array, words: jax.Array, params: EnvParams) -> TrainState:
         return learner.init(key, self.config.learner, self.model, words, params)

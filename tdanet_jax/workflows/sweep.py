@@ -20,6 +20,7 @@ from tdanet_jax.evaluation.comparison import Result
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import jsons, npz
 from tdanet_jax.splits import split_name
+from tdanet_jax.targets import known_classes
 
 #: Where the evaluated histories of a sweep's runs are kept.
 HISTORIES = "histories"
@@ -33,7 +34,7 @@ def plan(
     Raises:
       ValueError: a value is not allowed or given twice; the message names the flag.
     """
-    splits = [split_name(split) for split in splits]
+    splits = [split_name(split, known_classes(base.targets, base.data)) for split in splits]
     for flag, given in (("--splits", splits), ("--models", models), ("--seeds", seeds)):
         if not given:
             raise ValueError(f"{flag}: give at least one")

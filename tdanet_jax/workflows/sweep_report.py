@@ -11,7 +11,7 @@ from tdanet_jax.evaluation import comparison, paper
 from tdanet_jax.evaluation.comparison import Curve, Result, Spread
 from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.registry import MODELS
-from tdanet_jax.splits import UNSEEN
+from tdanet_jax.splits import NAMED
 from tdanet_jax.workflows.sweep import FinishedRun, evaluated_history, labels
 
 REPORT_VERSION = 1
@@ -43,7 +43,7 @@ class Report:
     def splits(self) -> list[str]:
         """The splits that were trained, in the order of the vocabulary."""
         names = {run.results["split"] for run in self.runs}
-        return [name for name in UNSEEN if name in names] + sorted(names - set(UNSEEN))
+        return [name for name in NAMED if name in names] + sorted(names - set(NAMED))
 
     def results(self, split: str) -> dict[str, list[Result]]:
         """Results on a split by label: policies without training, then models as in MODELS."""
@@ -186,7 +186,7 @@ def _comparison(report: Report, split: str) -> Iterator[str]:
         )
         for label, out in summaries.items()
     ]
-    theirs = paper.rates(split)
+    theirs = paper.rates(split, next(iter(results.values()))[0].get("targets"))
     rows += [((f"{agent} (paper)", "", ""), groups) for agent, groups in theirs.items()]
     tables = " (the paper's Tables I to III)" if split in PAPER_SPLITS else ""
     yield from ("", f"## Split {split}: comparison of models{tables}", "")

@@ -12,12 +12,14 @@ import jax
 
 from tdanet_jax import config as configs
 from tdanet_jax.analysis import figures
+from tdanet_jax.analysis.episode_lookup import name_ranges
 from tdanet_jax.config import CONFIG_FILE, OWN_TASK, WORD_VECTORS_FILE, TrainConfig
 from tdanet_jax.evaluation import episodes, policies, report, rollout
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import regular
 from tdanet_jax.models.factory import unused_flags
+from tdanet_jax.scenes.dataset import idle_rooms
 from tdanet_jax.task import load_task, resolve
 from tdanet_jax.training import checkpoint, devices
 from tdanet_jax.training.callbacks import Callbacks
@@ -68,6 +70,8 @@ def train(
     lists = episodes.load(task.tables, task.split, task.extras)  # errors show before training
     for flag in () if resume else unused_flags(config, task.classes):
         callbacks.on_note(f"note: {flag} changes nothing for {config.model}")
+    if idle := idle_rooms(task.tables, task.split):
+        callbacks.on_note(f"note: no target can be found in {name_ranges(idle)}: left out")
     # What "auto" means here is part of the run: it continues with the same products elsewhere.
     config = resolve(config)
     with files.locked(folder) if devices.is_lead() else contextlib.nullcontext():

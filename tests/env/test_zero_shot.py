@@ -55,8 +55,8 @@ def rooms(ithor: SceneTables) -> SceneTables:
 def only_these_rooms(monkeypatch: pytest.MonkeyPatch, rooms: SceneTables) -> None:
     """Splits name all 120 rooms; here they are cut down to those of `rooms`."""
 
-    def smaller(name: str, validation: bool = False) -> Split:
-        split = make_split(name, validation)
+    def smaller(*arguments: Any) -> Split:
+        split = make_split(*arguments)
         present = set(rooms.scenes)
         return dataclasses.replace(
             split,
@@ -182,9 +182,33 @@ def training_walk(params: EnvParams) -> tuple[Any, ...]:
 def test_perturbing_all_hidden_data_changes_nothing_that_training_reads(
     rooms: SceneTables, glove: WordVectors, split: tuple[str, bool], rows: str, sensors: bool
 ) -> None:
-    config = config_of(*split, rows, sensors)
-    hidden = make_split(*split).hidden
+    check_perturbed(config_of(*split, rows, sensors), make_split(*split).hidden, rooms, glove)
+
+
+@pytest.mark.parametrize(
+    ("targets", "split"),
+    [
+        ("all", "Kettle,Book,Laptop,Faucet"),
+        ("Kettle,Book,Mug,Pillow,Towel,Laptop", "Book"),
+        ("paper", "open"),
+        pytest.param("kitchen: all; bedroom: Book, Pillow", "Book", marks=pytest.mark.slow),
+    ],
+)
+def test_perturbing_hidden_data_changes_nothing_with_any_targets(
+    rooms: SceneTables, glove: WordVectors, targets: str, split: str
+) -> None:
+    config = dataclasses.replace(config_of(split, False, "object"), targets=targets)
+    hidden = make_split("open").hidden if split == "open" else set(split.split(","))
+    check_perturbed(config, hidden, rooms, glove)
+
+
+def check_perturbed(
+    config: TrainConfig, hidden: Collection[str], rooms: SceneTables, glove: WordVectors
+) -> None:
+    """Fails unless noise in the data of hidden classes changes evaluation alone."""
     task = make_task(config, rooms, glove)
+    assert set(task.split.hidden) == set(hidden)
+    assert {name for names in task.split.unseen.values() for name in names} <= set(hidden)
     noisy = perturbed(rooms, hidden, seed=1)
     other = make_task(config, noisy, other_words(glove, hidden, rooms.classes))
     assert_identical(task.train_params, other.train_params)

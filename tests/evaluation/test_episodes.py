@@ -13,8 +13,8 @@ from scipy import stats
 
 from tdanet_jax.evaluation import episodes, report
 from tdanet_jax.scenes import SceneTables
-from tdanet_jax.scenes.dataset import PublishedEpisode
-from tdanet_jax.splits import UNSEEN, make_split
+from tdanet_jax.scenes.dataset import PublishedEpisode, Rooms, find_targets
+from tdanet_jax.splits import OPEN, UNSEEN, make_split
 from tdanet_jax.vocabulary import TARGETS
 from tests.support.handmade import houses, lopsided
 from tests.support.oracle import ROOMS, World, pose_of
@@ -52,6 +52,47 @@ def test_the_committed_lists_are_those_that_are_drawn_from_these_tables(
     for group in drawn:
         np.testing.assert_array_equal(loaded[group].pose, drawn[group].pose)
         np.testing.assert_array_equal(loaded[group].target, drawn[group].target)
+
+
+def test_a_published_split_of_other_targets_has_other_episodes(ithor: SceneTables) -> None:
+    targets = {"kitchen": ("Toaster", "Mug"), "bedroom": ("Pillow", "CD")}
+    for chosen, group in zip(
+        episodes.load(ithor, make_split("18/4", targets=targets)).values(),
+        ({"Mug", "CD"}, {"Toaster", "Pillow"}),
+        strict=True,
+    ):
+        assert {ithor.targets[goal] for goal in chosen.target} == group
+        assert len(chosen) == 500
+
+
+@pytest.mark.parametrize("validation", [False, True])
+def test_the_open_benchmark_has_as_many_episodes_for_every_target(
+    ithor: SceneTables, validation: bool
+) -> None:
+    tables, targets = find_targets(OPEN, Rooms(ithor, None), validation)
+    split = make_split(OPEN, validation, targets)
+    loaded, drawn = episodes.load(tables, split), episodes.draw_split(tables, split)
+    assert list(loaded) == list(drawn) == ["seen", "unseen"]
+    for group, chosen in loaded.items():
+        np.testing.assert_array_equal(chosen.pose, drawn[group].pose)
+        np.testing.assert_array_equal(chosen.target, drawn[group].target)
+        assert (tables.distance[chosen.pose, chosen.target] >= 0).all()
+        scene = tables.position_scene[chosen.pose // 16]
+        assert {tables.scenes[s] for s in scene} <= set(split.eval_scenes)
+        asked = Counter(
+            (ROOMS[tables.room_type[s]], tables.targets[goal])
+            for s, goal in zip(scene, chosen.target, strict=True)
+        )
+        wanted = split.seen if group == "seen" else split.unseen
+        pairs = {(room, name) for room, names in wanted.items() for name in names}
+        assert set(asked) <= pairs
+        assert validation or set(asked) == pairs
+        assert set(asked.values()) == {10 if group == "seen" else 40}
+        pair = [(s, goal) for s, goal in zip(scene, chosen.target, strict=True)]
+        if group == "unseen" and not validation:  # 4 episodes or more in each of up to 10 rooms
+            assert min(Counter(pair).values()) >= 4
+    with pytest.raises(ValueError, match="belongs to scene tables"):
+        episodes.load(dataclasses.replace(tables, field_of_view=91.0), split)
 
 
 def test_the_lists_of_a_split_of_ones_own_are_the_same_everywhere(ithor: SceneTables) -> None:

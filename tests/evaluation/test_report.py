@@ -15,7 +15,7 @@ BUCKET = {"SR", "SPL", "SR_ci", "SPL_ci", "n"}
 TOP = [
     "version", "split", "model", "policy", "episodes_trained", "seen", "unseen", "by_room",
     "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "sensors",
-    "departures", "odometry", "triangulation", "commit",
+    "departures", "targets", "odometry", "triangulation", "commit",
 ]  # fmt: skip
 
 
@@ -41,6 +41,24 @@ def played(ithor):
 def written(played, ithor, tmp_path):
     provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 7, 200, ithor.data_version)
     return tmp_path, report.results(provenance, ithor, played, tmp_path)
+
+
+def test_intervals_of_the_open_benchmark_resample_classes(ithor) -> None:
+    """Two classes in many rooms, one always found, one never: the interval is all of 0 to 100."""
+    first = [int(np.flatnonzero(ithor.state_scene == scene)[0]) for scene in range(60)]
+    goals = np.arange(60) % 2
+    chosen = Episodes(np.array(first, np.int32), goals.astype(np.int32))
+    actions = np.full((60, 200), -1, np.int8)
+    actions[:, 0] = 5
+    records = Records(np.ones(60, int), np.ones(60, int), goals == 1, actions)
+    found = {}
+    for split in ("open", "18/4"):
+        origin = report.Provenance(split, "random", "random", 0, 0, 0, 0, ithor.data_version)
+        found[split] = report.results(origin, ithor, {"seen": (chosen, records)})
+    wide, narrow = (found[split]["seen"]["L>=1"]["SR_ci"] for split in found)
+    assert wide == [0.0, 100.0]
+    assert narrow[1] - narrow[0] < 40
+    assert found["open"]["by_target"] == found["18/4"]["by_target"]
 
 
 def test_results_have_the_documented_shape(written):

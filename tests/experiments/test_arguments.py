@@ -24,6 +24,8 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--split Mug,Pilow", "--split Mug,Pilow: no target is called Pilow; did you mean Pillow?"),
         ("--split Mug,mug", "--split Mug,mug: Mug is given twice"),
         ("--split=", "--split : choose one of"),
+        ("--targets Ketle", "--targets Ketle: no class of these rooms; did you mean Kettle?"),
+        ("--targets kitchen:", "--targets kitchen:: a name is missing; give paper, all, or"),
         ("--model cnn", "--model cnn: choose one of tdanet"),
         ("--model no.such", "--model no.such: No module named 'no'"),
         ("--model os.path", "--model os.path: the module has no function `make`"),

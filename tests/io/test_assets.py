@@ -15,6 +15,7 @@ from tdanet_jax.evaluation import episodes
 from tdanet_jax.io import assets
 from tdanet_jax.io.assets import AssetError
 from tdanet_jax.scenes import ithor
+from tdanet_jax.splits import OPEN_ASSET
 from tdanet_jax.tools import build_assets
 from tests.support import toy
 
@@ -120,6 +121,8 @@ def test_bundled_files_are_replaced_when_all_new_ones_are_whole(
     monkeypatch.setattr(build_assets, "notice_text", lambda wheels: "new")
     for module in (ithor, labels, words, episodes):
         monkeypatch.setattr(module, "build_asset", make(module.ASSET))
+    monkeypatch.setattr(words, "load_bundled", lambda path: path.read_text())
+    monkeypatch.setattr(build_assets.open_split, "build_asset", make(OPEN_ASSET))
     monkeypatch.setattr(ithor, "load_scenes", lambda path: [toy.corridor()])
     monkeypatch.setattr(labels, "names_in", lambda path: [])
     out = tmp_path / "assets"

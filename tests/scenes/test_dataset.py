@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneTables, dataset, tabulation
 from tdanet_jax.scenes.dataset import Extras, PublishedEpisode, Rooms
 from tdanet_jax.scenes.offline import exporter
-from tdanet_jax.splits import make_split
-from tdanet_jax.vocabulary import ROOM_TYPES
+from tdanet_jax.scenes.visibility.rules import RULES
+from tdanet_jax.splits import Split, make_split
+from tdanet_jax.vocabulary import ROOM_TYPES, TARGETS
 from tests.support import toy
 
 
@@ -161,6 +163,116 @@ def test_rooms_with_a_part_of_their_own() -> None:
     assert dataset.assign_rooms(split, Rooms(rooms.tables, None)) == split
 
 
+def split_in(rooms: Rooms, text: str, validation: bool = False, targets: str = "paper") -> Split:
+    """The split of these rooms, before it is cut down to them."""
+    _, chosen = dataset.find_targets(targets, rooms, validation)
+    return dataset.assign_rooms(make_split(text, validation, chosen), rooms, validation)
+
+
+@pytest.fixture(scope="module")
+def shops() -> Rooms:
+    """Two kitchens and two shops to train in, a shop to be tested in; the toaster is nowhere seen.
+
+    The vase is in the test room alone.
+    """
+    middle, behind = (0.0, toy.CAMERA, 1.2), (0.0, toy.CAMERA, 90.0)
+    things = {
+        "K1": ("kitchen", ["Kettle", "Mug"]),
+        "K2": ("kitchen", ["Bread"]),
+        "S1": ("shop", ["Mug", "Lathe", "Toaster"]),
+        "S2": ("shop", ["Book"]),
+        "S3": ("shop", ["Vase", "Lathe"]),
+    }
+    scenes = [
+        dataclasses.replace(
+            toy.room(
+                toy.line(3),
+                *(toy.thing(c, behind if c == "Toaster" else (0.1 * i, *middle[1:]))
+                  for i, c in enumerate(classes)),
+                name=name,
+            ),
+            room_type=kind,
+        )
+        for name, (kind, classes) in things.items()
+    ]  # fmt: skip
+    parts = {name: "test" if name == "S3" else "train" for name in things}
+    seen = dataclasses.replace(RULES, void=100.0)
+    return Rooms(tabulation.build(scenes, rules=seen), Extras(parts=parts))
+
+
+@pytest.mark.parametrize(
+    ("text", "kitchen", "shop"),
+    [
+        ("all", ("Bread", "Mug", "Kettle"), ("Mug", "Book", "Lathe")),
+        ("mugs, kettle", ("Mug", "Kettle"), ("Mug",)),
+        ("lathe", (), ("Lathe",)),
+        ("kitchen: kettle; shop: all", ("Kettle",), ("Mug", "Book", "Lathe")),
+        ("Mug; kitchen: Bread", ("Bread", "Mug"), ("Mug",)),
+    ],
+)
+def test_targets_are_the_classes_that_are_asked_for_where_they_can_be_found(
+    shops: Rooms, text: str, kitchen: tuple[str, ...], shop: tuple[str, ...]
+) -> None:
+    tables, found = dataset.find_targets(text, shops)
+    assert (found["kitchen"], found["shop"]) == (kitchen, shop)
+    assert not any(found[room] for room in ROOM_TYPES[1:])
+    assert {*kitchen, *shop} <= set(tables.targets)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("Ketle", "--targets Ketle: no class of these rooms; did you mean Kettle?"),
+        ("Unicorn", "--targets Unicorn: no class of these rooms"),
+        ("Toaster", "--targets Toaster: can be found in no training room"),
+        ("Vase", "--targets Vase: can be found in no training room"),
+        (
+            "Mug; kitchen: Lathe",
+            "--targets Lathe: can be found in no training room of type kitchen",
+        ),
+        ("attic: Mug", "--targets attic: no room type of these rooms; there are kitchen, "),
+    ],
+)
+def test_targets_that_cannot_be_found_are_refused(shops: Rooms, text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        dataset.find_targets(text, shops)
+    assert "\n" not in str(error.value)
+
+
+def test_the_papers_targets_are_as_they_were(shops: Rooms, ithor: SceneTables) -> None:
+    for tables in (ithor, shops.tables):
+        found, chosen = dataset.find_targets("paper", Rooms(tables, shops.extras))
+        assert found is tables
+        assert {room: chosen[room] for room in ROOM_TYPES} == TARGETS
+    assert chosen["shop"] == ("Toaster", "Mug", "Vase")  # as long as a room holds them
+
+
+def test_rooms_that_name_their_targets(shops: Rooms, tmp_path: Path) -> None:
+    assert shops.extras is not None
+    own = {"shop": ("Lathe", "Toaster")}
+    extras = dataclasses.replace(shops.extras, targets=own)
+    dataset.save_rooms(Rooms(shops.tables, extras), tmp_path / "rooms.npz")
+    back = dataset.load_rooms(tmp_path / "rooms.npz")
+    assert back.extras is not None
+    assert back.extras.targets == own
+    assert dataset.find_targets("paper", back)[1]["shop"] == ("Lathe",)  # the other is out of view
+    assert dataset.find_targets("Mug", back)[1]["shop"] == ("Mug",)
+    split = split_in(back, "Lathe", targets="Mug,Lathe,Book")
+    assert split.unseen["shop"] == ("Lathe",)
+    assert split.seen["shop"] == ("Mug", "Book")
+    for wrong in ({"attic": ("Mug",)}, {"shop": ("Unicorn",)}):
+        extras = dataclasses.replace(shops.extras, targets=wrong)
+        dataset.save_rooms(Rooms(shops.tables, extras), tmp_path / "wrong.npz")
+        with pytest.raises(FileError, match="targets of a room type or of a class"):
+            dataset.load_rooms(tmp_path / "wrong.npz")
+
+
+def test_rooms_without_a_target_are_named(shops: Rooms) -> None:
+    tables, chosen = dataset.find_targets("Kettle,Lathe", shops)
+    split = dataset.assign_rooms(make_split("22/0", targets=chosen), shops)
+    assert dataset.idle_rooms(tables, split.within(tables.scenes, tables.classes)) == ["K2", "S2"]
+
+
 def test_a_grid_of_its_own_is_kept(rooms: SceneTables, tmp_path: Path) -> None:
     """And tables without one are as before there were such grids, hash included."""
     assert b"grid" not in rooms.to_arrays()["rest"].tobytes()
@@ -209,7 +321,7 @@ def test_room_types_of_ones_own(tmp_path: Path) -> None:
     assert rooms.tables.subset(["A2"]).as_scene().room_type == "office"
     assert rooms.tables.data_version == tables.with_known_targets().data_version
     found = {
-        text: dataset.assign_rooms(make_split(text, validation), rooms, validation)
+        text: split_in(rooms, text, validation)
         for text, validation in (("22/0", False), ("18/4", False), ("Vase", True))
     }
     assert found["22/0"].seen["office"] == ("Mug", "Laptop")
@@ -257,9 +369,9 @@ def test_houses(tmp_path: Path) -> None:
     plain = tabulation.build([dataclasses.replace(scenes[1], room_type="kitchen")])
     assert others.data_version == plain.data_version != tables.subset(["H1"]).data_version
     assert plain.to_arrays()["room_type"].tolist() == [0]  # as files were before there were houses
-    split = dataset.assign_rooms(make_split("22/0"), rooms)
+    split = split_in(rooms, "22/0")
     assert (split.seen["hall"], split.seen["den"]) == (("Mug", "Laptop"), ("Laptop",))
-    split = dataset.assign_rooms(make_split("22/0", True), rooms, True).within(types, ("Mug",))
+    split = split_in(rooms, "22/0", True).within(types, ("Mug",))
     assert split.train_scenes == ("H1", "H2", "H3", "H4")
     assert split.eval_scenes == ("H5",)
     with pytest.raises(ValueError, match="houses with rooms of several types: the original"):

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tdanet_jax.poses import PoseGrid
-from tdanet_jax.scenes import SceneError, metadata
+from tdanet_jax.scenes import SceneError, dataset, metadata
 from tdanet_jax.scenes.room_names import Kinds
 
 BOX = {"center": {"x": 0.0, "y": 1.5, "z": 1.0}, "size": {"x": 0.2, "y": 0.2, "z": 0.2}}
@@ -93,6 +93,18 @@ def test_a_list_of_scenes(tmp_path: Path) -> None:
 def test_a_room_may_say_what_it_is_for(tmp_path: Path) -> None:
     assert [scene.part for scene in read(tmp_path, DOCUMENT)] == [None]
     assert [scene.part for scene in read(tmp_path, {**DOCUMENT, "split": "test"})] == ["test"]
+
+
+def test_rooms_may_name_their_targets(tmp_path: Path) -> None:
+    other = {**DOCUMENT, "name": "Den", "targets": ["desks", "mug"]}
+    assert [s.targets for s in read(tmp_path, [DOCUMENT, other])] == [(), ("Mug", "Desk")]
+    found = dataset.build_rooms(tmp_path / "scenes.json").extras
+    assert found is not None
+    assert found.targets == {"bedroom": ("Mug", "Desk")}
+    other["targets"] = ["Kettle"]
+    (tmp_path / "scenes.json").write_text(json.dumps([DOCUMENT, other]))
+    with pytest.raises(SceneError, match=r"scenes\.json: Den: targets: no room holds a Kettle"):
+        dataset.build_rooms(tmp_path / "scenes.json")
 
 
 def test_a_room_may_have_a_grid_of_its_own(tmp_path: Path) -> None:
@@ -203,6 +215,8 @@ CASES = [
     (["rotateStepDegrees"], 40, r"Lab: rotateStepDegrees 40, not one of \[15, 30, 45, 60, 90\]"),
     (["rotateStepDegrees"], "90", "Lab: rotateStepDegrees '90', not one of"),
     (["horizons"], 30, "Lab: horizons is not a list"),
+    (["targets"], "Mug", "Lab: targets is not a list of names of classes"),
+    (["targets"], ["a;b"], "Lab: targets is not a list of names of classes"),
     (["horizons"], [], r"Lab: horizons \[\]: must be whole degrees"),
     (["horizons"], [0, [30]], "Lab: horizons .*: must be whole degrees"),
     (["agent"], 3, "Lab: agent"),

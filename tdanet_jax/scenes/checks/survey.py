@@ -12,10 +12,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from tdanet_jax import words
-from tdanet_jax.scenes.dataset import Rooms, assign_rooms
+from tdanet_jax.scenes.dataset import Rooms, assign_rooms, find_targets
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.visibility.rules import RULES
 from tdanet_jax.splits import Split, make_split
+from tdanet_jax.targets import PAPER
 from tdanet_jax.vocabulary import ROOM_TYPES
 
 
@@ -101,13 +102,16 @@ def uses(rooms: Rooms) -> Iterator[str]:
 
     Warns of rooms that no split uses, and if there is nothing to train or to be evaluated in.
     """
-    tables = rooms.tables
-    split = assign_rooms(make_split("22/0"), rooms)
+    tables, targets = find_targets(PAPER, rooms)
+    split = assign_rooms(make_split("22/0", targets=targets), rooms)
     train = [name for name in tables.scenes if name in split.train_scenes]
     test = [name for name in tables.scenes if name in split.eval_scenes]
     yield f"Rooms to train in: {len(train)}; to be evaluated in: {len(test)}"
-    for room in tables.room_types[len(ROOM_TYPES) :]:
-        yield f"Targets in rooms of type {room}: {_listed(split.seen[room])}"
+    own = {} if rooms.extras is None else rooms.extras.targets
+    for room in (*own, *(r for r in tables.room_types[len(ROOM_TYPES) :] if r not in own)):
+        yield f"Targets in rooms of type {room}: {_listed(targets[room])}"
+        if lost := [name for name in own.get(room, ()) if name not in targets[room]]:
+            yield f"  left out, found in no training room of type {room}: {_listed(lost)}"
     unused = [name for name in tables.scenes if name not in {*train, *test}]
     if unused or not train or not test:
         named = f"no split uses {', '.join(unused)}; " if unused else ""

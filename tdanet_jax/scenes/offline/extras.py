@@ -21,6 +21,7 @@ from tdanet_jax.scenes.offline.layout import (
     scene_name,
     state_key,
 )
+from tdanet_jax.splits import in_order, is_plain, known_type
 from tdanet_jax.vocabulary import ROOM_TYPES
 
 MOST_EPISODES, MOST_CLASSES = 100_000, 2_000
@@ -32,6 +33,8 @@ NAMED = 3
 PARTS = ("test", "val")
 EPISODE_FOLDER, GRAPH_FOLDER = "test_val_split", "gcn"
 GRAPH_CLASSES, GRAPH_MATRIX = "objects.txt", "adjmat.dat"
+#: Targets by room type; not one of the original's files.
+TARGET_FILE = "targets.json"
 
 
 class KnownRoom(NamedTuple):
@@ -54,8 +57,12 @@ def read_extras(
     """
     places = list(folders)
     parents, adjacency = _first(places, PARENT_FILE), _first(places, GRAPH_FOLDER)
-    published = _first(places, EPISODE_FOLDER)
+    published, own = _first(places, EPISODE_FOLDER), _first(places, TARGET_FILE)
     extras, lines = Extras(), []
+    if own is not None:
+        classes = {name for room in rooms.values() for name in room.classes}
+        extras = dataclasses.replace(extras, targets=read_targets(own, classes))
+        lines.append(f"{own}: targets of {', '.join(extras.targets)}")
     if parents is not None:
         extras = dataclasses.replace(extras, parents=read_parents(parents))
         count = sum(len(targets) for targets in extras.parents.values())
@@ -110,6 +117,23 @@ def read_parents(path: Path) -> dict[str, dict[str, dict[str, float]]]:
             if any(reward < 0 for reward in room[target].values()):
                 raise FileError(path, f"{target}: a reward below 0")
     return result
+
+
+def read_targets(path: Path, classes: Collection[str]) -> dict[str, tuple[str, ...]]:
+    """Room type -> target classes, from `targets.json`.
+
+    Raises:
+      FileError: its structure is another, or no room holds a class.
+    """
+    found = {}
+    for title, names in jsons.members(path):
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise FileError(path, f"{title}: not a list of classes")
+        for name in names:
+            if name not in classes or not is_plain(name):
+                raise FileError(path, f"{title}: {name}: no room holds such a class")
+        found[known_type(title)] = in_order(names)
+    return found
 
 
 def read_graph(names_path: Path, matrix_path: Path) -> tuple[tuple[str, ...], np.ndarray]:

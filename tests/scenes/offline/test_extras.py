@@ -98,6 +98,17 @@ def test_broken_parents(tmp_path: Path) -> None:
             extras.read_parents(path)
 
 
+def test_targets_next_to_the_scenes(tmp_path: Path) -> None:
+    path = tmp_path / "targets.json"
+    path.write_text('{"LivingRoom": ["Vase", "Mug"], "shop": ["Mug"]}')
+    found = extras.read_targets(path, {"Mug", "Vase"})
+    assert found == {"living_room": ("Mug", "Vase"), "shop": ("Mug",)}
+    for content in ('["Mug"]', '{"shop": "Mug"}', '{"shop": [1]}', '{"shop": ["Kettle"]}'):
+        path.write_text(content)
+        with pytest.raises(FileError, match=r"targets\.json: "):
+            extras.read_targets(path, {"Mug", "Vase"})
+
+
 def test_broken_graphs(tmp_path: Path) -> None:
     names, matrix = tmp_path / "objects.txt", tmp_path / "adjmat.dat"
     for text, value, reason in (
