@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tdanet_jax.io import archive, files
+from tdanet_jax.io.escaping import in_line
 from tdanet_jax.io.untrusted import FileError, jsons, npz
-from tdanet_jax.scenes import cache, metadata, tabulation
+from tdanet_jax.scenes import cache, ithor, metadata, records, tabulation
 from tdanet_jax.scenes.metadata import FARTHEST
+from tdanet_jax.scenes.records import Records
 from tdanet_jax.scenes.room_names import Kinds, check_name
-from tdanet_jax.scenes.scene import MOST_CLASSES, MOST_ROOM_TYPES, SceneError
+from tdanet_jax.scenes.scene import MOST_CLASSES, MOST_ROOM_TYPES, Scene, SceneError
 from tdanet_jax.scenes.tables import FIELDS, SceneTables
 from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.splits import PARTS, TRAIN_SCENES_PER_TYPE, VALIDATION_TRAIN_SCENES_PER_TYPE, Split
@@ -45,6 +47,7 @@ class Extras:
       graph_classes: n class names, one for each row of `adjacency`.
       adjacency: [n, n] float32, the published class graph; [0, 0] without one.
       parts: room -> "train" or "test", for rooms whose scene file says it.
+      made: how the rooms were made, if they are variants: names -> numbers and versions.
     """
 
     parents: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(
@@ -54,6 +57,7 @@ class Extras:
     graph_classes: tuple[str, ...] = ()
     adjacency: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0), np.float32))
     parts: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    made: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
 
     def class_graph(self, classes: Sequence[str]) -> np.ndarray | None:
         """The class graph between `classes`: [C, C] float32, or None without one.
@@ -77,11 +81,28 @@ class Rooms:
     Attributes:
       path: the file that they were read from, next to which their feature maps are; None if they
         are not from a file.
+      records: what the tables do not say of the objects; None if it is not known. The bundled rooms
+        have them in their own file.
     """
 
     tables: SceneTables
     extras: Extras | None
     path: Path | None = None
+    records: Records | None = None
+
+    def scenes(self, names: Collection[str]) -> list[Scene]:
+        """Some of the rooms, in the order of the tables, with all that is known of their objects.
+
+        Raises:
+          SceneError: what lies on what is not known.
+        """
+        if self.extras is None:
+            return [scene for scene in ithor.load_scenes() if scene.name in names]
+        if self.records is None:
+            raise SceneError(
+                "these rooms do not say what lies on what: import them from a scene file"
+            )
+        return records.restore(self.records, self.tables, names, self.extras.parts)
 
 
 def load_rooms(path: str | Path | None, progress: Progress | None = None) -> Rooms:
@@ -98,7 +119,8 @@ def load_rooms(path: str | Path | None, progress: Progress | None = None) -> Roo
         tables = SceneTables.from_arrays(arrays)
         if problem := _find_problem(tables):
             raise ValueError(problem)
-        return Rooms(tables.with_known_targets(), _read_extras(arrays), path)
+        known = records.from_arrays(arrays, tables)
+        return Rooms(tables.with_known_targets(), _read_extras(arrays), path, known)
     except Exception as error:  # a missing array, a field of another type, broken JSON
         raise FileError(path, f"not a file of rooms ({error})") from None
 
@@ -124,7 +146,8 @@ def build_rooms(
         tables = tabulation.build(scenes, progress=progress)
     except SceneError as error:
         raise SceneError(f"{scene_file}: {error}") from None
-    return Rooms(tables, Extras(parts={s.name: s.part for s in scenes if s.part is not None}))
+    parts = {scene.name: scene.part for scene in scenes if scene.part is not None}
+    return Rooms(tables, Extras(parts=parts), records=records.of_scenes(scenes))
 
 
 def save_rooms(rooms: Rooms, path: Path | str) -> None:
@@ -136,10 +159,12 @@ def save_rooms(rooms: Rooms, path: Path | str) -> None:
         "episodes": [dataclasses.astuple(episode) for episode in extras.episodes],
         "graph_classes": extras.graph_classes,
         "parts": extras.parts,
+        **({"made": extras.made} if extras.made else {}),
     }
     arrays = rooms.tables.to_arrays()
     arrays["extras/notes"] = np.frombuffer(json.dumps(notes).encode(), np.uint8)
     arrays["extras/adjacency"] = extras.adjacency
+    arrays |= records.to_arrays(rooms.records or {})
     with files.replacing(path) as temporary:
         archive.write(temporary, arrays, compress=True)
 
@@ -209,6 +234,11 @@ def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
     parts = notes.get("parts", {})  # older files have none
     if not set(parts.values()) <= set(PARTS):
         raise ValueError(f"a room whose part is neither of {', '.join(PARTS)}")
+    made = notes.get("made", {})
+    if not all(
+        isinstance(v, str | int) and in_line(f"{k} {v}") == f"{k} {v}" for k, v in made.items()
+    ):
+        raise ValueError("how it was made is not in plain words and numbers")
     return Extras(
         parents={
             ROOM_TYPES[ROOM_TYPES.index(room)]: {
@@ -224,6 +254,7 @@ def _read_extras(arrays: Mapping[str, np.ndarray]) -> Extras:
         graph_classes=names,
         adjacency=adjacency,
         parts=parts,
+        made=made,
     )
 
 

@@ -96,6 +96,12 @@ def summary(tables: SceneTables) -> Iterator[str]:
         yield f"  {target}: {reason}: {', '.join(names)}"
 
 
+def making(rooms: Rooms) -> Iterator[str]:
+    """A line on how the rooms were made, if they are variants."""
+    if rooms.extras is not None and rooms.extras.made:
+        yield "Made by " + ", ".join(f"{name} {value}" for name, value in rooms.extras.made.items())
+
+
 def uses(rooms: Rooms) -> Iterator[str]:
     """Lines on what rooms can be used for and what they need.
 
