@@ -356,7 +356,7 @@ class Room:
             box = other.box
             if below is not None:
                 hole = other.object_class in HOLES and below.object_class not in HOLES
-                if other is below or (not hole and _holds(other.box, below.box)):
+                if other is below or (not hole and holds(other.box, below.box)):
                     continue
                 if hole:
                     box = box + np.array([[0, 0, 0], [0, HOLE, 0]])
@@ -421,7 +421,7 @@ def _contains(box: np.ndarray, place: np.ndarray) -> bool:
     return bool(((box[0] <= place) & (place <= box[1]))[LEVEL].all())
 
 
-def _holds(box: np.ndarray, inner: np.ndarray) -> bool:
+def holds(box: np.ndarray, inner: np.ndarray) -> bool:
     """Whether a box has most of another's footprint over or in it, and reaches its height."""
     common = np.minimum(box[1], inner[1]) - np.maximum(box[0], inner[0])
     return bool((common > 0).all() and np.prod(common[LEVEL]) >= 0.8 * _footprint(inner))

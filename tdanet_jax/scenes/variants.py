@@ -20,7 +20,9 @@ from tdanet_jax.scenes.vary import vary
 #: The seed of the variants in training: the same for all seeds of a run, which thus share them.
 SEED = 0
 
-_MODULES = ("scenes.reachable", "scenes.placement", "scenes.vary", "scenes.variants")
+_MODULES = tuple(
+    f"scenes.{name}" for name in ("reachable", "placement", "furniture", "vary", "variants")
+)
 
 
 def source(rooms: Rooms, names: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""Variants of rooms: the same room with small objects elsewhere, some left out, or mirrored.
+"""Variants of rooms: small objects elsewhere, some left out, furniture shifted, half mirrored.
 
 A variant follows from its room, from statistics of training rooms, a seed and its number alone, to
 the last bit. Its name begins with that of its room, so that it has the same type and part.
@@ -12,11 +12,13 @@ import zlib
 
 import numpy as np
 
+from tdanet_jax.scenes import furniture
 from tdanet_jax.scenes.placement import Statistics, replace
 from tdanet_jax.scenes.room_names import UNKNOWN, kind_of
 from tdanet_jax.scenes.scene import Scene, SceneObject
 
 LEFT_OUT = 0.1  # share of the small objects that are not in a variant
+SHIFTED = 0.5  # share of the furniture that is shifted, where there is room for it
 
 
 def variant_name(name: str, copy: int) -> str:
@@ -38,11 +40,12 @@ def vary(scene: Scene, known: Statistics, seed: int, copy: int) -> Scene:
     """
     draw = np.random.default_rng([seed, copy, zlib.crc32(scene.name.encode())])
     name = variant_name(scene.name, copy)
+    arranged = furniture.shift(scene, draw, SHIFTED)
     varied = dataclasses.replace(
-        scene,
+        arranged,
         name=name,
         part=scene.part or (kind_of(name) or UNKNOWN).part,
-        objects=replace(scene, known, draw, LEFT_OUT),
+        objects=replace(arranged, known, draw, LEFT_OUT),
         default_position=None,
         default_rotation=None,
     )
