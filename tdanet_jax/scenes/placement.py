@@ -13,7 +13,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from tdanet_jax.scenes.reachable import RADIUS
+from tdanet_jax.scenes.reachable import HEIGHT, RADIUS
 from tdanet_jax.scenes.scene import Scene, SceneObject
 from tdanet_jax.scenes.visibility.rules import RULES
 
@@ -342,16 +342,16 @@ class Room:
 
     def _free(self, boxes: np.ndarray, surface: Surface | None) -> np.ndarray:
         """Whether each of `boxes` [N, 2, 3] on a surface meets nothing that is there: [N] bool."""
-        gap = RADIUS
-        below = None
-        if surface is not None:
-            below = surface.receptacle
-            gap = self._known.rest[below.object_class].gap
-        level = float(np.median(self._scene.points[:, 1]))
+        below = None if surface is None else surface.receptacle
         free = np.ones(len(boxes), bool)
-        if surface is not None:
-            reach = boxes[:, 0, 1] < level + 0.9
-            free = ~reach | (_gaps(boxes, self._scene.points) >= gap - TOUCHING)
+        if below is not None:
+            points = self._scene.points
+            gap = self._known.rest[below.object_class].gap
+            if (_gaps(below.box[None], points) == 0).any():
+                # A corner of floor lies in its box: its edge may be a step from where agents stand.
+                gap = max(gap, RADIUS + self._scene.grid.grid_size)
+            low = boxes[:, 0, 1] < np.median(points[:, 1]) + HEIGHT / 2
+            free = ~low | (_gaps(boxes, points) >= gap - TOUCHING)
         for other in self._there:
             box = other.box
             if below is not None:

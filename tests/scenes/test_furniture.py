@@ -149,4 +149,4 @@ def test_points_follow_in_real_rooms(pairs: list[tuple[Scene, Scene]]) -> None:
             for item in after.objects:
                 if item.object_id in moved and item.box[0, 1] < 1.5:
                     assert gap(item.box, at) >= 0.2 - 1e-9 or item.corners is not None
-    assert freed > 10
+    assert freed > 5

@@ -193,6 +193,24 @@ def test_nothing_stands_where_an_agent_can(pairs: list[tuple[Scene, Scene]]) -> 
                 assert placement._gaps(item.box[None], before.points)[0] >= min(was, 0.18)
 
 
+def test_what_is_on_a_counter_around_a_corner_keeps_clear_of_the_corners_floor() -> None:
+    """Of an L-shaped counter, the box has floor in it; its edge may be a step from the points."""
+    spots = toy.points(*((0.25 * x, 0.25 * z) for x in range(5) for z in range(5)))
+    counter = toy.thing("CounterTop", (0.5, 0.45, 0.5), (3.0, 0.9, 3.0))
+    mug = lying(toy.thing("Mug", (-0.8, 1, -0.8), (0.1, 0.1, 0.1)), counter)
+    room = toy.room(spots, counter, mug)
+    known = placement.statistics([room])
+    known = dataclasses.replace(
+        known, rest={"CounterTop": dataclasses.replace(known.rest["CounterTop"], gap=0.2)}
+    )
+    seen = []
+    for seed in range(40):
+        objects = placement.replace(room, known, np.random.default_rng(seed), 0.0)
+        [item] = [o for o in objects if o.pickupable]
+        seen.append(placement._gaps(item.box[None], spots)[0])
+    assert 0.43 < min(seen) < 0.5
+
+
 def test_what_is_shut_in_or_on_the_floor_stays() -> None:
     egg = dataclasses.replace(toy.thing("Egg", (0, 1, 3)), parents=("Fridge|0",), pickupable=True)
     ball = dataclasses.replace(toy.thing("BasketBall", (0, 0.1, -1)), pickupable=True)
