@@ -311,7 +311,11 @@ class Vary:
                 rooms, names, train, self.copies, self.seed,
                 lambda done, total: report(done / total, "built"),
             )  # fmt: skip
-        console.print(*survey.summary(varied.tables), *survey.making(varied), sep="\n")
+        if empty := len(names) * self.copies - len(varied.tables.scenes):
+            console.print(f"Left out, as no target can be found in them: {empty} variants")
+        if not varied.tables.scenes:
+            fail("vary: no variant is left")
+        console.print(next(survey.summary(varied.tables)), *survey.making(varied), sep="\n")
         dataset.save_rooms(varied, self.out)
         console.print(f"{self.out}")
 

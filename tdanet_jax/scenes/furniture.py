@@ -34,6 +34,9 @@ KEPT = 0.95  # share of a room's reachable points that must be left
 STANDING = 0.9  # metres of an agent's y above the floor
 SAMPLES = 0.05  # metres between the places at which the floor is looked at
 SLACK = 0.02  # metres that reachable floor extends beyond the agent's radius
+#: Places [8, 2] on the edge of the agent's circle.
+RIM = RADIUS * np.array([(1, 0), (0.7, 0.7), (0, 1), (-0.7, 0.7), (-1, 0), (-0.7, -0.7), (0, -1),
+                         (0.7, -0.7)])  # fmt: skip
 #: Metres from a reachable point to furniture or a wall, at most, if the next point is blocked.
 NEXT = RADIUS + reachable.GRID_SIZE
 
@@ -173,21 +176,35 @@ def _reachable(
 ) -> np.ndarray:
     """The points [P, 3] once furniture, `unit`, has moved off its `area` [2, 2].
 
-    Those that are now blocked are gone. Those that it blocked are found as in the bundled rooms,
-    but only where the agent's whole circle is on known floor.
+    Those that are now blocked are gone. Of those that it blocked, the neighbours of reachable
+    points are reachable if the agent's capsule stands free there, as in the bundled rooms, and if
+    its whole circle is on known floor.
     """
-    level = float(np.median(points[:, 1]))
+    level, size = float(np.median(points[:, 1])), reachable.GRID_SIZE
     kept = points[reachable.clear(points[:, LEVEL], level, moved)]
-    if len(kept) == 0:
-        return kept
-    added = reachable.complete(kept, objects)
-    added = added[~reachable.clear(added[:, LEVEL], level, unit)]
-    angles = np.arange(8) * np.pi / 4
-    rim = RADIUS * np.stack([np.cos(angles), np.sin(angles)], axis=1).round(6)
-    circle = (added[:, None, LEVEL] + rim).reshape(-1, 2)
-    inside = _is_floor(circle, area, points).reshape(-1, 8).all(axis=1)
-    inside &= _is_floor(added[:, LEVEL], area, points)
-    every = np.concatenate([kept, added[inside]])
+    boxes = np.array([item.box[:, LEVEL] for item in unit])
+    low, high = boxes[:, 0].min(axis=0) - RADIUS, boxes[:, 1].max(axis=0) + RADIUS
+    near = [
+        item
+        for item in objects
+        if (item.box[0, LEVEL] < high + RADIUS).all() and (item.box[1, LEVEL] > low - RADIUS).all()
+    ]
+    axes = [np.arange(np.ceil(low[a] / size), np.floor(high[a] / size) + 1) * size for a in (0, 1)]
+    spots = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    spots = spots[_is_floor(spots, area, points) & ~reachable.clear(spots, level, unit)]
+    spots = spots[reachable.clear(spots, level, near)]
+    circle = (spots[:, None] + RIM).reshape(-1, 2)
+    spots = spots[_is_floor(circle, area, points).reshape(-1, len(RIM)).all(axis=1)]
+    found = kept[:, LEVEL]
+    while len(spots):
+        steps = np.abs(spots[:, None] - found).sum(axis=2).min(axis=1, initial=np.inf)
+        beside = steps < 1.1 * size
+        new = beside & (steps > 0.1 * size)
+        found, spots = np.concatenate([found, spots[new]]), spots[~beside]
+        if not new.any():
+            break
+    added = np.insert(found[len(kept) :], 1, level, axis=1)
+    every = np.concatenate([kept, added])
     return every[np.lexsort((every[:, 2], every[:, 0]))]
 
 

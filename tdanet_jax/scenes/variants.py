@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import tdanet_jax
 from tdanet_jax.io import assets
 from tdanet_jax.scenes import cache, ithor, tabulation
+from tdanet_jax.scenes.checks import survey
 from tdanet_jax.scenes.dataset import Extras, Rooms
 from tdanet_jax.scenes.placement import statistics
 from tdanet_jax.scenes.records import of_scenes
@@ -52,6 +53,8 @@ def make(
 ) -> Rooms:
     """Variants 1 to `copies` of some rooms, room by room, with a note on how they were made.
 
+    Those in which no target can be found are left out.
+
     Args:
       names: the rooms.
       known: the training rooms from which the statistics are.
@@ -60,12 +63,22 @@ def make(
     Raises:
       SceneError: the rooms do not say what lies on what, or there are too many of them.
     """
-    usual = statistics(rooms.scenes(known))
-    varied = [
-        vary(scene, usual, seed, copy)
-        for scene in rooms.scenes(names)
-        for copy in range(1, copies + 1)
-    ]
+    usual, varied = statistics(rooms.scenes(known)), list[Scene]()
+    for scene in rooms.scenes(names):
+        for copy in range(1, copies + 1):
+            varied.append(vary(scene, usual, seed, copy))
+            if progress is not None:
+                progress(len(varied) / 3, len(names) * copies)
+
+    def report(done: float, total: int) -> None:
+        if progress is not None:
+            progress((total + 2 * done) / 3, total)
+
+    classes, targets = rooms.tables.classes, rooms.tables.targets
+    tables = tabulation.build(varied, classes, targets, progress=report)
+    if empty := survey.without_targets(tables):
+        varied = [scene for scene in varied if scene.name not in empty]
+        tables = tables.subset([scene.name for scene in varied])
     extras = Extras(
         parts={scene.name: scene.part for scene in varied if scene.part is not None},
         made={
@@ -77,8 +90,6 @@ def make(
             "version": tdanet_jax.__version__,
         },
     )
-    classes, targets = rooms.tables.classes, rooms.tables.targets
-    tables = tabulation.build(varied, classes, targets, progress=progress)
     return Rooms(tables, extras, records=of_scenes(varied))
 
 
@@ -102,12 +113,13 @@ def load(
         if not scenes:
             scenes.extend(rooms.scenes(names))
         known = statistics(scenes)
-        varied = [vary(scene, known, SEED, copy) for scene in scenes]
 
         def report(done: float, total: int) -> None:
             if progress is not None:
                 progress((copy - 1) * total + done, copies * total)
 
+        report(0.0, len(scenes))
+        varied = [vary(scene, known, SEED, copy) for scene in scenes]
         tables = rooms.tables
         return tabulation.build(varied, tables.classes, tables.targets, progress=report)
 

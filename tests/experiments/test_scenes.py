@@ -317,7 +317,8 @@ def test_variants_are_written_compared_and_drawn(
     assert lines[0].startswith("Made by command vary")
     rows = {line[:46].strip(): line[46:].split() for line in lines[1:]}
     assert rows["rooms"] == ["1", "2"]  # with the room that they are from
-    assert rows["reachable points in a room"] == [f"{len(known[0].points):.1f}"] * 2
+    counts = [len(known[0].points), len(rooms.tables.position) / 2]
+    assert rows["reachable points in a room"] == [f"{count:.1f}" for count in counts]
     assert float(rows["random agent, SR"][0]) > 0
     run("inspect FloorPlan416-v02 --data variants.npz --out room.png")
     assert Path("room.png").stat().st_size > 10_000

@@ -102,6 +102,17 @@ def making(rooms: Rooms) -> Iterator[str]:
         yield "Made by " + ", ".join(f"{name} {value}" for name, value in rooms.extras.made.items())
 
 
+def without_targets(tables: SceneTables) -> list[str]:
+    """The rooms in which no target of their type can be found."""
+    split = assign_rooms(make_split("22/0"), Rooms(tables, None))
+    asked = np.array(
+        [[t in split.seen[room] for t in tables.targets] for room in tables.room_types]
+    )
+    found = (tables.reachable & asked[tables.position_room_type]).any(axis=1)
+    full = np.bincount(tables.position_scene, found, len(tables.scenes)) > 0
+    return [name for name, holds in zip(tables.scenes, full, strict=True) if not holds]
+
+
 def uses(rooms: Rooms) -> Iterator[str]:
     """Lines on what rooms can be used for and what they need.
 
