@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from tdanet_jax.poses import GRID_SIZE
 from tdanet_jax.scenes import reachable
 from tdanet_jax.scenes.placement import LEVEL, SAME, chain, holds, shifted, supports
 from tdanet_jax.scenes.reachable import RADIUS
@@ -38,7 +39,7 @@ SLACK = 0.02  # metres that reachable floor extends beyond the agent's radius
 RIM = RADIUS * np.array([(1, 0), (0.7, 0.7), (0, 1), (-0.7, 0.7), (-1, 0), (-0.7, -0.7), (0, -1),
                          (0.7, -0.7)])  # fmt: skip
 #: Metres from a reachable point to furniture or a wall, at most, if the next point is blocked.
-NEXT = RADIUS + reachable.GRID_SIZE
+NEXT = RADIUS + GRID_SIZE
 
 
 def shift(scene: Scene, draw: np.random.Generator, share: float) -> Scene:
@@ -50,7 +51,7 @@ def shift(scene: Scene, draw: np.random.Generator, share: float) -> Scene:
     Args:
       share: of the furniture, the part that is tried.
     """
-    if (scene.grid.grid_size, isinstance(scene.room_type, str)) != (reachable.GRID_SIZE, True):
+    if (scene.grid.grid_size, isinstance(scene.room_type, str)) != (GRID_SIZE, True):
         return scene  # the rule of reachable points is for this grid; houses have rooms
     floor = float(np.median(scene.points[:, 1])) - STANDING
     names = [
@@ -180,7 +181,7 @@ def _reachable(
     points are reachable if the agent's capsule stands free there, as in the bundled rooms, and if
     its whole circle is on known floor.
     """
-    level, size = float(np.median(points[:, 1])), reachable.GRID_SIZE
+    level, size = float(np.median(points[:, 1])), GRID_SIZE
     kept = points[reachable.clear(points[:, LEVEL], level, moved)]
     boxes = np.array([item.box[:, LEVEL] for item in unit])
     low, high = boxes[:, 0].min(axis=0) - RADIUS, boxes[:, 1].max(axis=0) + RADIUS
