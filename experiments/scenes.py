@@ -118,6 +118,8 @@ class Inspect:
     """Scene file (JSON) with the room; by default the bundled rooms."""
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote, instead of the bundled ones."""
+    variants: int = 0
+    """Draws instead the floor plans of the room and of its first variants, those of --seed 0."""
     out: Path = Path("scene.png")
     """Picture to write; an existing one is replaced."""
 
@@ -126,6 +128,9 @@ class Inspect:
         from tdanet_jax.analysis import pictures
 
         check_picture(self.out)
+        if self.variants:
+            self._draw_variants()
+            return
         if self.position is None and (self.rotation or self.horizon):
             fail("--rotation and --horizon need --position")
         if self.position is not None and not all(map(math.isfinite, self.position)):
@@ -137,6 +142,25 @@ class Inspect:
             state = tables.nearest_state(0, *self.position, self.rotation, self.horizon)
         self.out.parent.mkdir(parents=True, exist_ok=True)
         pictures.room(room, tables, state, self.out)
+        console.print(f"{self.out}")
+
+    def _draw_variants(self) -> None:
+        from tdanet_jax.analysis import pictures
+        from tdanet_jax.scenes import dataset
+        from tdanet_jax.scenes.placement import statistics
+        from tdanet_jax.scenes.vary import vary
+
+        check_positive(variants=self.variants)
+        check_at_most("variants", self.variants, MOST_VARIANTS)
+        if self.position is not None or self.rotation or self.horizon or self.scenes is not None:
+            fail("--variants takes no --position, --rotation, --horizon or --scenes")
+        rooms = load_rooms(self.data)
+        self._check(rooms.tables.scenes)
+        train = dataset.assign_rooms(make_split("22/0"), rooms).train_scenes
+        known, [room] = statistics(rooms.scenes(train)), rooms.scenes([self.scene])
+        varied = [vary(room, known, 0, copy) for copy in range(1, self.variants + 1)]
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        pictures.plans([room, *varied], self.out)
         console.print(f"{self.out}")
 
     def _room(self) -> tuple[Scene, SceneTables]:

@@ -361,7 +361,8 @@ class Room:
                 if hole:
                     box = box + np.array([[0, 0, 0], [0, HOLE, 0]])
             overlap = np.minimum(boxes[:, 1], box[1]) - np.maximum(boxes[:, 0], box[0])
-            free &= (overlap <= TOUCHING).any(axis=1)
+            thinner = np.minimum(boxes[:, 1] - boxes[:, 0], box[1] - box[0])
+            free &= (overlap <= np.minimum(TOUCHING, thinner / 2)).any(axis=1)
         return free
 
 

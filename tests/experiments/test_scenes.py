@@ -321,7 +321,9 @@ def test_variants_are_written_compared_and_drawn(
     assert rows["reachable points in a room"] == [f"{count:.1f}" for count in counts]
     assert float(rows["random agent, SR"][0]) > 0
     run("inspect FloorPlan416-v02 --data variants.npz --out room.png")
-    assert Path("room.png").stat().st_size > 10_000
+    run("inspect FloorPlan416 --variants 1 --data rooms.npz --out plans.png")
+    for picture in ("room.png", "plans.png"):
+        assert Path(picture).stat().st_size > 10_000
     test_room = Rooms(ithor.subset(names[1:]), Extras(), records=records.of_scenes(known[1:]))
     dataset.save_rooms(test_room, Path("test.npz"))
     none = fails(scenes, shlex.split("vary --data test.npz --out new.npz"), capsys)

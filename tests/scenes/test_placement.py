@@ -176,7 +176,9 @@ def test_nothing_that_moved_meets_anything(pairs: list[tuple[Scene, Scene]]) -> 
             for other in after.objects:
                 common = np.minimum(item.box[1], other.box[1])
                 common = common - np.maximum(item.box[0], other.box[0])
-                if (common <= 0.011).any() or other in (item, below) or below.pickupable:
+                thinner = np.minimum(np.ptp(item.box, axis=0), np.ptp(other.box, axis=0))
+                apart = (common <= np.minimum(0.011, thinner / 2 + 1e-4)).any()
+                if apart or other in (item, below) or below.pickupable:
                     continue
                 span = np.minimum(below.box[1], other.box[1])
                 span = span - np.maximum(below.box[0], other.box[0])
