@@ -91,6 +91,22 @@ def test_it_meets_nothing_and_cuts_nothing_off() -> None:
         assert table.box[1, 0] <= counter.box[0, 0]
 
 
+def test_no_part_of_the_points_is_cut_off() -> None:
+    """A passage of one point, next to a bin; on the far side is a tenth of the points."""
+    can = toy.thing("GarbageCan", (1.5, 0.3, 0.0), (0.2, 0.6, 0.2))
+    spots = toy.points(
+        *((0.25 * x, 0.25 * z) for x in range(5) for z in range(-2, 3)), (1.25, 0.5), (1.5, 0.5),
+        (1.75, 0.5), (1.75, 0.0), (1.75, 0.25),
+    )  # fmt: skip
+    scene = toy.room(spots, can)
+    unit, way = list(scene.objects), np.array([0.0, 0.0, 0.25])
+    assert len(parts(spots)) == 1
+    without = toy.points(*((p[0], p[2]) for p in spots if p[0] < 1.6))  # none on the far side
+    assert furniture._moved(scene, unit, can.object_id, way, 0.0) is None
+    alone = dataclasses.replace(scene, points=without)
+    assert furniture._moved(alone, unit, can.object_id, way, 0.0) is not None
+
+
 def test_what_is_built_in_or_hangs_stays() -> None:
     counter = toy.thing("CounterTop", (1.5, 0.45, 1.5), (0.7, 0.9, 0.7))
     shelf = toy.thing("ShelvingUnit", (1.5, 1.5, 1.5), (0.3, 0.4, 0.3))

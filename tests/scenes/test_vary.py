@@ -91,6 +91,10 @@ def test_mirrored_twice_is_the_room(seed: int) -> None:
         np.testing.assert_array_equal(one.box, other.box)
         assert one.rotation == other.rotation
     assert not (np.diff(vary.mirrored(scene).points[:, 0]) < 0).any()
+    turned = dataclasses.replace(scene.objects[0], rotation=(10.0, 60.0, 20.0))
+    scene = dataclasses.replace(scene, objects=(turned,), default_rotation=45)
+    once = vary.mirrored(scene)
+    assert (once.objects[0].rotation, once.default_rotation) == ((10.0, 300.0, 340.0), 315)
 
 
 def test_variants_are_named_mirrored_and_drawn_by_their_numbers(rooms: dict[str, Scene]) -> None:
