@@ -2,6 +2,8 @@
 
 python -m experiments.scenes verify
 python -m experiments.scenes inspect FloorPlan228
+python -m experiments.scenes vary --copies 16 --out variants.npz
+python -m experiments.scenes compare variants.npz
 python -m experiments.scenes import my_rooms.json --out my_rooms.npz
 python -m experiments.scenes import --from thor_v1_offline_data --out original.npz
 python -m experiments.scenes export --out our_rooms
@@ -32,6 +34,7 @@ from experiments.console import (
     one_line_usage,
     reporter,
 )
+from tdanet_jax.config import MOST_VARIANTS, check_seed
 from tdanet_jax.io import files
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.splits import UNSEEN, make_split
@@ -115,6 +118,8 @@ class Inspect:
     """Scene file (JSON) with the room; by default the bundled rooms."""
     data: str | None = None
     """File of rooms that `experiments.scenes import` wrote, instead of the bundled ones."""
+    variants: int = 0
+    """Draws instead the floor plans of the room and of its first variants, those of --seed 0."""
     out: Path = Path("scene.png")
     """Picture to write; an existing one is replaced."""
 
@@ -123,6 +128,9 @@ class Inspect:
         from tdanet_jax.analysis import pictures
 
         check_picture(self.out)
+        if self.variants:
+            self._draw_variants()
+            return
         if self.position is None and (self.rotation or self.horizon):
             fail("--rotation and --horizon need --position")
         if self.position is not None and not all(map(math.isfinite, self.position)):
@@ -136,6 +144,25 @@ class Inspect:
         pictures.room(room, tables, state, self.out)
         console.print(f"{self.out}")
 
+    def _draw_variants(self) -> None:
+        from tdanet_jax.analysis import pictures
+        from tdanet_jax.scenes import dataset
+        from tdanet_jax.scenes.placement import statistics
+        from tdanet_jax.scenes.vary import vary
+
+        check_positive(variants=self.variants)
+        check_at_most("variants", self.variants, MOST_VARIANTS)
+        if self.position is not None or self.rotation or self.horizon or self.scenes is not None:
+            fail("--variants takes no --position, --rotation, --horizon or --scenes")
+        rooms = load_rooms(self.data)
+        self._check(rooms.tables.scenes)
+        train = dataset.assign_rooms(make_split("22/0"), rooms).train_scenes
+        known, [room] = statistics(rooms.scenes(train)), rooms.scenes([self.scene])
+        varied = [vary(room, known, 0, copy) for copy in range(1, self.variants + 1)]
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        pictures.plans([room, *varied], self.out)
+        console.print(f"{self.out}")
+
     def _room(self) -> tuple[Scene, SceneTables]:
         """The room and its tables."""
         from tdanet_jax.scenes import dataset, ithor, metadata, tabulation
@@ -143,10 +170,11 @@ class Inspect:
         if self.data is not None:
             if self.scenes is not None:
                 fail("--scenes and --data: choose one")
-            tables = dataset.load_rooms(self.data).tables
-            self._check(tables.scenes)
-            tables = tables.subset([self.scene])
-            return tables.as_scene(), tables
+            given = dataset.load_rooms(self.data)
+            self._check(given.tables.scenes)
+            tables = given.tables.subset([self.scene])
+            known = given.records is not None
+            return given.scenes([self.scene])[0] if known else tables.as_scene(), tables
         rooms = ithor.load_scenes() if self.scenes is None else metadata.read_scenes(self.scenes)
         names = [room.name for room in rooms]
         self._check(names)
@@ -263,6 +291,100 @@ class Import:
             return importer.read_folder(self.source, show, kinds, frame)
 
 
+@dataclasses.dataclass(frozen=True)
+class Vary:
+    """Writes a file of variants of rooms: small objects elsewhere, half of the rooms mirrored.
+
+    The same arguments give the same file, which says how it was made. To train in variants, use
+    `train_zero_shot --variants` instead; it needs no file.
+    """
+
+    out: Path
+    """File to write; it must not exist."""
+    copies: int = 16
+    """Variants of each room, called FloorPlan1-v01 and so on; those with even numbers are
+    mirrored."""
+    seed: int = 0
+    """Random seed of the variants."""
+    part: Literal["train", "test", "all"] = "train"
+    """The rooms to vary. What lies on what is taken from the training rooms in any case."""
+    data: str | None = None
+    """File of rooms that `experiments.scenes import` wrote from a scene file, instead of the
+    bundled ones."""
+
+    def run(self) -> None:
+        """Writes the file."""
+        from tdanet_jax.scenes import dataset, variants
+        from tdanet_jax.scenes.checks import survey
+
+        check_positive(copies=self.copies)
+        check_at_most("copies", self.copies, MOST_VARIANTS)
+        check_seed(self.seed)
+        check_new_file(self.out)
+        remove_abandoned(self.out)
+        rooms = load_rooms(self.data)
+        split = dataset.assign_rooms(make_split("22/0"), rooms)
+        parts = {"train": split.train_scenes, "test": split.eval_scenes}
+        train = [name for name in rooms.tables.scenes if name in parts["train"]]
+        chosen = parts.get(self.part, (*parts["train"], *parts["test"]))
+        names = [name for name in rooms.tables.scenes if name in chosen]
+        if not train or not names:
+            fail(f"{self.data}: has no {'training' if not train else self.part} rooms")
+        with reporter("variants") as report:
+            varied = variants.make(
+                rooms, names, train, self.copies, self.seed,
+                lambda done, total: report(done / total, "built"),
+            )  # fmt: skip
+        if empty := len(names) * self.copies - len(varied.tables.scenes):
+            console.print(f"Left out, as no target can be found in them: {empty} variants")
+        if not varied.tables.scenes:
+            fail("vary: no variant is left")
+        console.print(next(survey.summary(varied.tables)), *survey.making(varied), sep="\n")
+        dataset.save_rooms(varied, self.out)
+        console.print(f"{self.out}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Compare:
+    """Compares rooms with the bundled training rooms: sizes, what is in view, how hard tasks are.
+
+    Variants are compared with the rooms that they come from.
+    """
+
+    rooms: tyro.conf.Positional[str]
+    """File of rooms that `experiments.scenes vary` or `import` wrote."""
+    data: str | None = None
+    """File of rooms to compare with, instead of the bundled ones."""
+
+    def run(self) -> None:
+        """Prints the table."""
+        from tdanet_jax.evaluation import room_statistics
+        from tdanet_jax.scenes import dataset
+        from tdanet_jax.scenes.checks import survey
+        from tdanet_jax.scenes.vary import original_name
+        from tdanet_jax.training import devices
+
+        devices.start()
+        given, other = dataset.load_rooms(self.rooms), load_rooms(self.data)
+        train = dataset.assign_rooms(make_split("22/0"), other).train_scenes
+        known = [name for name in other.tables.scenes if name in train]
+        origins = {original_name(name) for name in given.tables.scenes}
+        chosen = [name for name in other.tables.scenes if name in origins] or known
+        if not chosen:
+            fail(f"{self.data}: has no training rooms to compare with")
+        title = "bundled" if self.data is None else Path(self.data).stem[:11]
+        columns = {title: other.tables.subset(chosen), Path(self.rooms).stem[:11]: given.tables}
+        console.print(*survey.making(given), *room_statistics.table(columns), sep="\n")
+
+
+def load_rooms(data: str | None) -> dataset.Rooms:
+    """The rooms of a file, or the bundled ones, with progress while they are rebuilt."""
+    from tdanet_jax.scenes import dataset
+
+    with reporter("rooms", transient=True) as report:
+        return dataset.load_rooms(data, lambda done, total: report(done / total, "rebuilt"))
+
+
 def remove_abandoned(*outs: Path) -> None:
     """Removes the unfinished versions of --out that killed processes left."""
     for out in outs:
@@ -294,15 +416,13 @@ class Export:
         """Writes the folder."""
         from tdanet_jax import words
         from tdanet_jax.env.reward import named_parents
-        from tdanet_jax.scenes import dataset
         from tdanet_jax.scenes.offline import exporter
 
         if self.word_vectors is not None and not self.vectors:
             fail(f"--word-vectors {self.word_vectors}: only with --vectors")
         check_new_file(self.out, in_folder=False)
         remove_abandoned(self.out)
-        with reporter("rooms", transient=True) as rebuilt:
-            rooms = dataset.load_rooms(self.data, lambda n, total: rebuilt(n / total, "rebuilt"))
+        rooms = load_rooms(self.data)
         tables, extras = rooms.tables, rooms.extras
         parents = extras.parents if extras and extras.parents else named_parents(tables)
         if self.scenes:
@@ -405,6 +525,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "build": Build,
     "verify": Verify,
     "inspect": Inspect,
+    "vary": Vary,
+    "compare": Compare,
     "import": Import,
     "export": Export,
     "collect": Collect,

@@ -26,6 +26,8 @@ BUDGETS = ("steps", "episodes", "minutes")
 CONFIG_FILE = "config.json"
 #: Name of the file in a run's folder that holds a copy of the vectors of --word-vectors.
 WORD_VECTORS_FILE = "word_vectors.npz"
+#: Variants of a room.
+MOST_VARIANTS = 400
 #: Environment variable: comma-separated modules of custom models and sensors that a run's config
 #: may import.
 TRUST = "TDANET_TRUST"
@@ -152,6 +154,9 @@ class TrainConfig:
     validation: bool = False
     """For choosing settings: train in 16 of the 20 training rooms of each type with one more class
     held out, and evaluate in the other four."""
+    variants: int = 0
+    """Variants of each training room to train in as well: small objects elsewhere, some left out,
+    half of the variants mirrored (docs/scenes.md). They are built once and cached."""
     chunk_updates: int = 10
     """Updates per compiled call; progress is reported after each call."""
     checkpoint_minutes: float = 2.0
@@ -266,7 +271,7 @@ class EvalConfig:
         return {name: value for name, value in values.items() if value}
 
     def locate(self, config: TrainConfig, run: Path | str) -> TrainConfig:
-        """A run's configuration with the files to evaluate it with.
+        """A run's configuration with the files to evaluate it with, and no variants to train in.
 
         Args:
           config: the run's.
@@ -286,7 +291,7 @@ class EvalConfig:
                     "place with --data"
                 )
         words = find_word_vectors(config, run, self.word_vectors)
-        return dataclasses.replace(config, data=data, word_vectors=words)
+        return dataclasses.replace(config, data=data, word_vectors=words, variants=0)
 
 
 def describe_departures(departures: Mapping[str, Any]) -> str:
@@ -347,7 +352,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     ),
     (
         (
-            "history", "final_learning_rate", "entropy_weight", "final_entropy_weight",
+            "history", "variants", "final_learning_rate", "entropy_weight", "final_entropy_weight",
             "value_weight",
         ),
         lambda value: value >= 0,
@@ -364,6 +369,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
         "be at most 1,000,000",
     ),
     (("width", "hidden"), lambda value: value <= 8192, "be at most 8192"),
+    (("variants",), lambda value: value <= MOST_VARIANTS, f"be at most {MOST_VARIANTS}"),
     (("size_noise",), lambda value: 0 <= value <= 2, "be between 0 and 2"),
     (("gamma", "gae_lambda"), lambda value: 0 <= value <= 1, "be between 0 and 1"),
     (("dropout",), lambda value: 0 <= value < 1, "be at least 0 and below 1"),

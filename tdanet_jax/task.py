@@ -23,10 +23,12 @@ from tdanet_jax.models.classes import ClassVocabulary, make_vocabulary
 from tdanet_jax.models.factory import make_model, resolve_precision
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.poses import PoseGrid
+from tdanet_jax.scenes import tabulation, variants
 from tdanet_jax.scenes.dataset import Extras, Rooms, assign_rooms, find_targets, load_rooms
 from tdanet_jax.scenes.offline.features import features_path, load_features
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.tabulation import Progress
+from tdanet_jax.scenes.target_distances import with_targets
 from tdanet_jax.splits import Split, make_split
 from tdanet_jax.words import WordVectors
 
@@ -40,13 +42,14 @@ class Task:
       split: which rooms and classes train.
       classes: the vocabulary, and the part of it that training may know.
       model: the network.
-      train_params: the training rooms, without hidden classes.
+      train_params: the training rooms and their variants, without hidden classes.
       eval_params: all rooms and classes, with the test step limits; `reset` begins in the
         evaluation's rooms alone.
       train_words: [C, D], zero for hidden classes.
       words: [C, D], vectors of all classes.
       vectors: the table of word vectors that they are from.
       extras: what came with imported rooms; None with the bundled ones.
+      variants_version: hash of the tables of the variants among the training rooms; None without.
     """
 
     tables: SceneTables
@@ -59,6 +62,7 @@ class Task:
     words: jax.Array
     vectors: WordVectors
     extras: Extras | None = None
+    variants_version: str | None = None
 
     @property
     def spec(self) -> ObservationSpec:
@@ -117,7 +121,7 @@ def make(
         raise ValueError(f"split {split!r}: must be 'train' or 'test'")
     config = dataclasses.replace(config or TrainConfig(), split=name.removeprefix(ITHOR))
     config.check()
-    task = load_task(config)
+    task = load_task(config if split == "train" else dataclasses.replace(config, variants=0))
     params = task.train_params if split == "train" else task.eval_params
     words = task.train_words if split == "train" else task.words
     return Environment(name, params, task.tables.classes, words), params
@@ -127,27 +131,33 @@ def load_task(config: TrainConfig, progress: Progress | None = None) -> Task:
     """The task of a configuration, with the rooms and word vectors that it names.
 
     Args:
-      progress: called with (rooms done, rooms in all) while bundled rooms are rebuilt.
+      progress: called with (rooms done, rooms in all) while bundled rooms are rebuilt, or variants.
 
     Raises:
       ValueError: a file is broken, or does not hold what the split needs; names the file.
     """
-    return task_in(load_rooms(config.data, progress), config)
+    return task_in(load_rooms(config.data, progress), config, progress)
 
 
-def task_in(rooms: Rooms, config: TrainConfig) -> Task:
+def task_in(rooms: Rooms, config: TrainConfig, progress: Progress | None = None) -> Task:
     """The task of a configuration in these rooms, whichever rooms it names itself.
+
+    Args:
+      progress: called with (variants done, variants in all) while variants are built.
 
     Raises:
       ValueError: a file is broken, or the rooms do not hold what the split or the model needs.
     """
     vectors = word_vectors.load_word_vectors(config.word_vectors, rooms.tables.classes)
     data = None if rooms.path is None else str(rooms.path)
-    config, features = resolve(dataclasses.replace(config, data=data)), None
+    config, features, varied = resolve(dataclasses.replace(config, data=data)), None, None
     if rooms.path is not None and config.network.image == "features":
         features = load_features(rooms.path, rooms.tables)
     try:
-        return make_task(config, rooms.tables, vectors, rooms.extras, features)
+        if config.variants:
+            names = _split(config, rooms)[1].train_scenes
+            varied = variants.load(rooms, names, config.variants, progress)
+        return make_task(config, rooms.tables, vectors, rooms.extras, features, varied)
     except ValueError as error:
         if rooms.path is None:
             raise
@@ -160,6 +170,7 @@ def make_task(
     vectors: WordVectors,
     extras: Extras | None = None,
     features: np.ndarray | None = None,
+    varied: SceneTables | None = None,
 ) -> Task:
     """The task of a configuration in the given rooms; the split is limited to what they hold.
 
@@ -171,16 +182,14 @@ def make_task(
         replace those found in the training rooms. Hidden classes are in neither.
       features: [S, 512, 7, 7], ResNet-18's maps of all poses, for models that are shown an image.
         Images show hidden classes as well: nothing can be filtered out of them.
+      varied: variants of the training rooms, to train in as well. Parents and class graph are those
+        of the rooms themselves.
 
     Raises:
       ValueError: there are no rooms to train or to evaluate in, a class has no word vector, or the
         model needs feature maps and there are none.
     """
-    rooms = Rooms(tables, extras)
-    tables, targets = find_targets(config.sought, rooms, config.validation)
-    split = make_split(config.split, config.validation, targets)
-    split = assign_rooms(split, rooms, config.validation)
-    split = split.within(tables.scenes, tables.classes)
+    tables, split = _split(config, Rooms(tables, extras))
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
     adjacency = None if extras is None else extras.class_graph(tables.classes)
     if adjacency is None:
@@ -191,6 +200,12 @@ def make_task(
     train_words = zero_shot.hide_words(words, tables.classes, split.hidden)
     parents = _parents(seen_rooms, split, extras)
     trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]
+    if varied is not None:
+        if features is not None and model.encoder.maps:
+            raise ValueError("--variants: there are no feature maps of the variants")
+        varied = with_targets(varied, tables.targets)
+        hidden = zero_shot.hide_classes(varied, split.hidden)
+        seen_rooms = tabulation.join([seen_rooms, hidden], tables.classes)
     train_maps, eval_maps = _feature_maps(config.model, model, features, trains, tables.grid)
     rewarded = config.learner.partial_reward
     similarity = None
@@ -224,7 +239,16 @@ def make_task(
         words=jnp.asarray(words),
         vectors=vectors,
         extras=extras,
+        variants_version=None if varied is None else varied.data_version,
     )
+
+
+def _split(config: TrainConfig, rooms: Rooms) -> tuple[SceneTables, Split]:
+    """The rooms with the targets of a configuration, and its split, limited to what they hold."""
+    tables, targets = find_targets(config.sought, rooms, config.validation)
+    split = make_split(config.split, config.validation, targets)
+    split = assign_rooms(split, rooms, config.validation)
+    return tables, split.within(tables.scenes, tables.classes)
 
 
 def _feature_maps(

@@ -38,6 +38,8 @@ def test_paper_preset_has_the_reference_constants():
             "no class to train on in living_room besides the one that --validation holds out",
         ),
         (TrainConfig(model="cnn"), "--model cnn"),
+        (TrainConfig(variants=-1), "--variants -1: must not be negative"),
+        (TrainConfig(variants=401), "--variants 401: must be at most 400"),
         (TrainConfig(steps=0), "--steps 0"),
         (TrainConfig(minutes=-1.0), "--minutes -1.0"),
         (TrainConfig(steps=10**400), "--steps 1000"),

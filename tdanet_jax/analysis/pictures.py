@@ -200,3 +200,23 @@ def room(scene: Scene, tables: SceneTables, state: int, path: Path) -> None:
 
 #: Of objects in view, by whether they are visible.
 _COLORS = {True: GREEN, False: BLUE}
+
+
+def plans(scenes: Sequence[Scene], path: Path) -> None:
+    """The floor plans of some rooms side by side, small objects in colour and with their names.
+
+    Args:
+      path: ends in a format of Matplotlib, say .png.
+    """
+    drawn = [floor_plan.of_scene(scene) for scene in scenes]
+    spans = [(plan.extent[2] - plan.extent[0], plan.extent[3] - plan.extent[1]) for plan in drawn]
+    high = 4.6  # inches
+    widths = [high * max(x / z for x, z in spans)] * min(len(scenes), 2)
+    handle = Patch(facecolor=(BLUE, 0.13), edgecolor=BLUE, label="small objects")
+    figure, panels = _panels(len(scenes), widths, high, scenes[0].name, [handle])
+    for axes, scene, plan in zip(panels, scenes, drawn, strict=True):
+        small = {i: BLUE for i, k in enumerate(plan.objects) if scene.objects[k].pickupable}
+        drawing.draw_plan(axes, plan, None, small, scale=0.7)
+        counts = f"{len(plan.points)} reachable points, {len(scene.objects)} objects"
+        axes.set_title(in_figure(f"{scene.name}: {counts}"), fontsize=9.5)
+    drawing.save(figure, path)

@@ -1,7 +1,7 @@
-"""The cache of the bundled rooms' tables, which are computed once per machine.
+"""The cache of tables, which are computed once per machine: of the bundled rooms, and of variants.
 
-The name of a cached file contains a hash of everything that determines it: the bundled rooms and
-the source of the modules that compute the tables; or tables and further targets
+The name of a cached file contains a hash of everything that determines it: the rooms and the
+source of the modules that compute the tables; or tables and further targets
 (`target_distances`). Files are written atomically, and if several
 processes need the tables at the same time, one computes them while the others wait.
 """
@@ -18,7 +18,7 @@ import shutil
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,11 +32,10 @@ from tdanet_jax.scenes.tables import SceneTables
 VARIABLE = "TDANET_CACHE"
 #: Files that have not been used for this long are removed when new tables are stored.
 UNUSED_DAYS = 30
-#: Prefixes of tables, and of the folders in which an import keeps the scenes that it has read.
-TABLES, IMPORTS = "ithor-", "import-"
-#: Prefix of distances to targets that tables do not have (`target_distances`).
-DISTANCES = "distances-"
-_MODULES = (
+#: Prefixes of tables, of those of variants, of distances to targets that tables do not have
+#: (`target_distances`), and of the folders in which an import keeps the scenes that it has read.
+TABLES, VARIANTS, DISTANCES, IMPORTS = "ithor-", "variants-", "distances-", "import-"
+MODULES = (
     "io.archive",
     "poses",
     "vocabulary",
@@ -78,23 +77,32 @@ def _temporary() -> tempfile.TemporaryDirectory[str]:
 
 def key() -> str:
     """Hash of everything that determines the bundled tables, 16 hex digits."""
-    digest = hashlib.sha256(assets.sha256(assets.path(ithor.ASSET)).encode())
-    for name in _MODULES:
+    return source_hash(MODULES, assets.sha256(assets.path(ithor.ASSET)))
+
+
+def source_hash(modules: Sequence[str], *others: str) -> str:
+    """Hash of the source of modules of this package and of other texts, 16 hex digits."""
+    digest = hashlib.sha256("".join(others).encode())
+    for name in modules:
         module = importlib.import_module(f"tdanet_jax.{name}")
         digest.update(inspect.getsource(module).encode())
     return digest.hexdigest()[:16]
 
 
 def load_tables(progress: tabulation.Progress | None = None) -> SceneTables:
-    """The tables of the bundled rooms, from the cache, or computed and then cached.
+    """The tables of the bundled rooms, from the cache, or computed and then cached."""
+    return load_or_build(
+        f"{TABLES}{key()}", lambda: tabulation.build(ithor.load_scenes(), progress=progress)
+    )
+
+
+def load_or_build(name: str, build: Callable[[], SceneTables]) -> SceneTables:
+    """The tables in the cached file of a name, or built and then cached.
 
     Warns if a cached file is damaged, which is then replaced, and if the cache cannot be written.
     """
-
-    def compute() -> dict[str, np.ndarray]:
-        return tabulation.build(ithor.load_scenes(), progress=progress).to_arrays()
-
-    return SceneTables.from_arrays(load(f"{TABLES}{key()}.npz", compute))
+    arrays = load(f"{name}.npz", lambda: build().to_arrays())
+    return SceneTables.from_arrays(arrays)
 
 
 def load(name: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -103,7 +111,7 @@ def load(name: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, n
     Args:
       name: of the file; it contains a hash of everything that determines the arrays.
 
-    Warns as `load_tables` does.
+    Warns as `load_or_build` does.
     """
     path = folder() / name
     if (found := _read(path)) is not None:
@@ -158,7 +166,7 @@ def _remove_unused(place: Path) -> None:
     A process that reads them has them open, or computes again what it does not find.
     """
     oldest = time.time() - UNUSED_DAYS * 86400
-    kinds = (f"{TABLES}*.npz", f"{DISTANCES}*.npz", f"{IMPORTS}*")
+    kinds = [f"{kind}*" for kind in (TABLES, VARIANTS, DISTANCES, IMPORTS)]
     for path in [path for kind in kinds for path in place.glob(kind)]:
         with contextlib.suppress(OSError):
             if path.stat().st_mtime >= oldest:

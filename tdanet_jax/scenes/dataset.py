@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,11 @@ import numpy as np
 
 from tdanet_jax import targets
 from tdanet_jax.io import archive, files
+from tdanet_jax.io.escaping import in_line
 from tdanet_jax.io.untrusted import FileError, jsons, npz
-from tdanet_jax.scenes import cache, metadata, tabulation
+from tdanet_jax.scenes import cache, ithor, metadata, records, tabulation
 from tdanet_jax.scenes.metadata import FARTHEST
+from tdanet_jax.scenes.records import Records
 from tdanet_jax.scenes.room_names import Kinds, check_name
 from tdanet_jax.scenes.scene import MOST_CLASSES, MOST_ROOM_TYPES, Scene, SceneError
 from tdanet_jax.scenes.tables import FIELDS, SceneTables
@@ -58,6 +60,7 @@ class Extras:
       adjacency: [n, n] float32, the published class graph; [0, 0] without one.
       parts: room -> "train" or "test", for rooms whose scene file says it.
       targets: room type -> target classes, if the data say which they are.
+      made: how the rooms were made, if they are variants: names -> numbers and versions.
     """
 
     parents: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(
@@ -68,6 +71,7 @@ class Extras:
     adjacency: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0), np.float32))
     parts: Mapping[str, str] = dataclasses.field(default_factory=dict)
     targets: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    made: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
 
     def class_graph(self, classes: Sequence[str]) -> np.ndarray | None:
         """The class graph between `classes`: [C, C] float32, or None without one.
@@ -91,11 +95,28 @@ class Rooms:
     Attributes:
       path: the file that they were read from, next to which their feature maps are; None if they
         are not from a file.
+      records: what the tables do not say of the objects; None if it is not known. The bundled rooms
+        have them in their own file.
     """
 
     tables: SceneTables
     extras: Extras | None
     path: Path | None = None
+    records: Records | None = None
+
+    def scenes(self, names: Collection[str]) -> list[Scene]:
+        """Some of the rooms, in the order of the tables, with all that is known of their objects.
+
+        Raises:
+          SceneError: what lies on what is not known.
+        """
+        if self.extras is None:
+            return [scene for scene in ithor.load_scenes() if scene.name in names]
+        if self.records is None:
+            raise SceneError(
+                "these rooms do not say what lies on what: import them from a scene file"
+            )
+        return records.restore(self.records, self.tables, names, self.extras.parts)
 
 
 def load_rooms(path: str | Path | None, progress: Progress | None = None) -> Rooms:
@@ -112,7 +133,8 @@ def load_rooms(path: str | Path | None, progress: Progress | None = None) -> Roo
         tables = SceneTables.from_arrays(arrays)
         if problem := _find_problem(tables):
             raise ValueError(problem)
-        return Rooms(tables.with_known_targets(), _read_extras(arrays, tables), path)
+        known = records.from_arrays(arrays, tables)
+        return Rooms(tables.with_known_targets(), _read_extras(arrays, tables), path, known)
     except Exception as error:  # a missing array, a field of another type, broken JSON
         raise FileError(path, f"not a file of rooms ({error})") from None
 
@@ -142,7 +164,8 @@ def build_rooms(
         if lacking := sorted({*scene.targets} - {*tables.classes}):
             raise SceneError(f"{scene_file}: {scene.name}: targets: no room holds a {lacking[0]}")
     parts = {s.name: s.part for s in scenes if s.part is not None}
-    return Rooms(tables, Extras(parts=parts, targets=_own_targets(scenes)))
+    extras = Extras(parts=parts, targets=_own_targets(scenes))
+    return Rooms(tables, extras, records=records.of_scenes(scenes))
 
 
 def _own_targets(scenes: Sequence[Scene]) -> dict[str, tuple[str, ...]]:
@@ -164,10 +187,12 @@ def save_rooms(rooms: Rooms, path: Path | str) -> None:
         "graph_classes": extras.graph_classes,
         "parts": extras.parts,
         "targets": extras.targets,
+        **({"made": extras.made} if extras.made else {}),
     }
     arrays = rooms.tables.to_arrays()
     arrays["extras/notes"] = np.frombuffer(json.dumps(notes).encode(), np.uint8)
     arrays["extras/adjacency"] = extras.adjacency
+    arrays |= records.to_arrays(rooms.records or {})
     with files.replacing(path) as temporary:
         archive.write(temporary, arrays, compress=True)
 
@@ -240,6 +265,11 @@ def _read_extras(arrays: Mapping[str, np.ndarray], tables: SceneTables) -> Extra
     own = {room: tuple(names) for room, names in notes.get("targets", {}).items()}
     if not {*own} <= {*tables.room_types} or not {*sum(own.values(), ())} <= {*tables.classes}:
         raise ValueError("targets of a room type or of a class that it does not hold")
+    made = notes.get("made", {})
+    if not all(
+        isinstance(v, str | int) and in_line(f"{k} {v}") == f"{k} {v}" for k, v in made.items()
+    ):
+        raise ValueError("how it was made is not in plain words and numbers")
     return Extras(
         parents={
             ROOM_TYPES[ROOM_TYPES.index(room)]: {
@@ -256,6 +286,7 @@ def _read_extras(arrays: Mapping[str, np.ndarray], tables: SceneTables) -> Extra
         adjacency=adjacency,
         parts=parts,
         targets=own,
+        made=made,
     )
 
 

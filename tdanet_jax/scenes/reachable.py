@@ -45,7 +45,7 @@ def complete(points: np.ndarray, objects: Sequence[SceneObject]) -> np.ndarray:
         near = near[~(near[:, None] == known).all(axis=2).any(axis=1)]
         if bounds is not None:
             near = near[_within(near, bounds)]
-        found = near[_clear(near * GRID_SIZE, level, objects)]
+        found = near[clear(near * GRID_SIZE, level, objects)]
         known = np.concatenate([known, found])
         bounds = known if bounds is None else bounds
     added = np.unique(known[len(points) :], axis=0) * GRID_SIZE
@@ -69,7 +69,7 @@ def _within(cells: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     return result
 
 
-def _clear(places: np.ndarray, level: float, objects: Sequence[SceneObject]) -> np.ndarray:
+def clear(places: np.ndarray, level: float, objects: Sequence[SceneObject]) -> np.ndarray:
     """Whether a capsule at each of `places` [N, 2] (x, z) stands free of all boxes: [N] bool."""
     middle = np.stack([places[:, 0], np.full(len(places), level), places[:, 1]], axis=1)
     half = HEIGHT / 2 - RADIUS  # of the capsule's axis

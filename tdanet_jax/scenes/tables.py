@@ -201,17 +201,22 @@ class SceneTables:
             distance=self.distance[:, known],
         )
 
-    def as_scene(self) -> Scene:
-        """The only scene of these tables: its points, and its objects with their boxes."""
-        types = tuple(self.room_types[kind] for kind in self.position_room_type)
+    def as_scene(self, number: int = 0) -> Scene:
+        """One scene of these tables: its points, and its objects with their boxes."""
+        here = self.position_scene == number
+        types = [self.room_types[kind] for kind in self.position_room_type[here]]
         objects = tuple(
-            SceneObject(name, self.classes[self.object_class[i]], box.reshape(2, 3))
-            for i, (name, box) in enumerate(zip(self.object_id, self.object_box, strict=True))
+            SceneObject(
+                self.object_id[i],
+                self.classes[self.object_class[i]],
+                self.object_box[i].reshape(2, 3),
+            )
+            for i in np.flatnonzero(self.object_scene == number)
         )
         return Scene(
-            self.scenes[0],
-            types if self.room_type[0] < 0 else types[0],
-            self.position,
+            self.scenes[number],
+            types[0] if len({*types}) == 1 else tuple(types),
+            self.position[here],
             objects,
             grid=self.grid,
         )

@@ -80,6 +80,11 @@ class Run:
                 f"{self.folder}: trained on scene tables {meta['data_version']}, "
                 f"these are {self.task.tables.data_version}"
             )
+        if meta.get("variants") != self.task.variants_version:
+            raise ValueError(
+                f"{self.folder}: trained in variants {meta.get('variants')}, "
+                f"these are {self.task.variants_version}"
+            )
         self.seconds = float(meta["seconds"])
         self._saved = int(state.updates)
         return jax.device_put(state, self._layout)
@@ -91,10 +96,14 @@ class Run:
           ValueError: it cannot be written; those before it are as they were.
         """
         if self._saved != int(self.state.updates):
-            version = self.task.tables.data_version
+            meta = {
+                "seconds": self.seconds,
+                "data_version": self.task.tables.data_version,
+                "variants": self.task.variants_version,
+            }
             state = devices.whole(self.state, self._mesh)
             if devices.is_lead():
-                self.checkpoints.save(state, {"seconds": self.seconds, "data_version": version})
+                self.checkpoints.save(state, meta)
             self._saved = int(self.state.updates)
 
     @property

@@ -220,6 +220,19 @@ def check_perturbed(
     assert not np.array_equal(task.words, other.words)
 
 
+def test_so_it_is_in_variants(rooms: SceneTables, glove: WordVectors) -> None:
+    config, hidden = config_of("18/4", False, "object"), make_split("18/4").hidden
+    train = rooms.subset(name for name in make_split("18/4").train_scenes if name in rooms.scenes)
+    varied = dataclasses.replace(train, scenes=tuple(f"{name}-v01" for name in train.scenes))
+    params, same, other = (
+        make_task(config, rooms, glove, varied=tables).train_params
+        for tables in (varied, perturbed(varied, hidden, 1), perturbed(varied, {"Mug"}, 1))
+    )
+    assert len(params.next_position) == 2 * len(train.position)
+    assert_identical(params, same)
+    assert_differ(params, other, "row_box", "visible", "pair_starts")
+
+
 @pytest.mark.parametrize(
     ("model", "paid"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import importlib
 import json
 import re
@@ -14,7 +15,9 @@ import pytest
 
 from experiments import scenes
 from tdanet_jax.poses import PoseGrid
-from tdanet_jax.scenes import SceneTables, dataset
+from tdanet_jax.scenes import SceneTables, dataset, records
+from tdanet_jax.scenes import ithor as bundled
+from tdanet_jax.scenes.dataset import Extras, Rooms
 from tests.experiments.test_data import fails
 from tests.scenes.test_metadata import DOCUMENT
 from tests.support.command import TINY
@@ -284,6 +287,51 @@ def test_export_says_what_it_leaves_out(tmp_path: Path, capsys: pytest.CaptureFi
     assert re.search(r"Of \d+ test episodes in the exported rooms, \d+ start there", said)
     scenes.main(["export", "--out", str(tmp_path / "whole"), "--scenes", "FloorPlan428"])
     assert "Left out" not in capsys.readouterr().out
+
+
+def test_variants_are_written_compared_and_drawn(
+    ithor: SceneTables,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def run(command: str) -> None:
+        scenes.main(command.split())
+
+    monkeypatch.chdir(tmp_path)
+    names = ("FloorPlan416", "FloorPlan430")  # for training and for tests
+    known = [room for room in bundled.load_scenes() if room.name in names]
+    given = Rooms(ithor.subset(names), Extras(), records=records.of_scenes(known))
+    dataset.save_rooms(given, Path("rooms.npz"))
+    run("vary --copies 2 --seed 7 --data rooms.npz --out variants.npz")
+    said = capsys.readouterr().out
+    assert "2 rooms, " in said
+    assert "Made by command vary, copies 2, seed 7, source " in said
+    rooms = dataset.load_rooms("variants.npz")
+    assert rooms.tables.scenes == ("FloorPlan416-v01", "FloorPlan416-v02")
+    run("vary --copies 1 --part all --data rooms.npz --out all.npz")
+    assert dataset.load_rooms("all.npz").tables.scenes == ("FloorPlan416-v01", "FloorPlan430-v01")
+    capsys.readouterr()
+    run("compare variants.npz --data rooms.npz")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("Made by command vary")
+    rows = {line[:46].strip(): line[46:].split() for line in lines[1:]}
+    assert rows["rooms"] == ["1", "2"]  # with the room that they are from
+    counts = [len(known[0].points), len(rooms.tables.position) / 2]
+    assert rows["reachable points in a room"] == [f"{count:.1f}" for count in counts]
+    assert float(rows["random agent, SR"][0]) > 0
+    run("inspect FloorPlan416-v02 --data variants.npz --out room.png")
+    run("inspect FloorPlan416 --variants 1 --data rooms.npz --out plans.png")
+    for picture in ("room.png", "plans.png"):
+        assert Path(picture).stat().st_size > 10_000
+    test_room = Rooms(ithor.subset(names[1:]), Extras(), records=records.of_scenes(known[1:]))
+    dataset.save_rooms(test_room, Path("test.npz"))
+    none = fails(scenes, shlex.split("vary --data test.npz --out new.npz"), capsys)
+    assert "test.npz: has no training rooms" in none
+    dataset.save_rooms(dataclasses.replace(given, records=None), Path("tables.npz"))
+    unknown = fails(scenes, shlex.split("vary --data tables.npz --out new.npz"), capsys)
+    assert "these rooms do not say what lies on what: import them from a scene file" in unknown
+    assert not Path("new.npz").exists()
 
 
 def test_inspect_own_and_bundled_rooms(scene_file: Path) -> None:

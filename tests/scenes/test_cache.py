@@ -51,7 +51,7 @@ def forbid_building(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_built_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[int, int]] = []
     first = cache.load_tables(lambda done, total: calls.append((done, total)))
-    assert calls == [(1, 1)]
+    assert calls[-1] == (1, 1)  # and before, on a slow machine, shares
     forbid_building(monkeypatch)
     assert cache.load_tables().data_version == first.data_version
     assert sorted(path.suffix for path in files_of(folder)) == [".npz", ".sha256"]

@@ -32,6 +32,20 @@ PARAMS, AGENT, SUITE = "env/params.py", "agent/agent.py", "sensors/suite.py"
 ODOMETRY, TRIANGULATION = "sensors/odometry.py", "sensors/triangulation.py"
 TEST_TDANET = "models/test_tdanet.py"
 FAULTS = (
+    Fault("variants know of test rooms", "scenes/variants.py", "known = statistics(scenes)",
+          "known = statistics(rooms.scenes(rooms.tables.scenes))", "scenes/test_variants.py"),
+    Fault("variants show hidden classes", "task.py", "zero_shot.hide_classes(varied, split.hidden)",
+          "varied", "env/test_zero_shot.py"),
+    Fault("variants ignore the seed", "scenes/vary.py", "default_rng([seed, copy,",
+          "default_rng([copy,", "scenes/test_vary.py"),
+    Fault("small objects in one another", "scenes/placement.py", "self._there += found", "pass",
+          "scenes/test_placement.py"),
+    Fault("small objects float", "scenes/placement.py", "surface.height - box[0, 1], axis=1",
+          "surface.height - box[0, 1] + 0.05, axis=1", "scenes/test_placement.py"),
+    Fault("furniture in walls", "scenes/furniture.py",
+          "if not _is_floor(lattice, area, scene.points).all() or", "if", "scenes/test_furniture.py"),
+    Fault("points cut off", "scenes/furniture.py", " or _parts(points) > _parts(scene.points)", "",
+          "scenes/test_furniture.py"),
     Fault("a copy of word vectors is rough", "words.py", "np.where(whole[:, None], vectors, rounded)",
           "rounded", "test_words.py"),
     Fault("a run's copy is not looked at", "config.py", "(run / WORD_VECTORS_FILE, Path(config.w",

@@ -109,6 +109,15 @@ def assert_same_history(ours, theirs):
         chex.assert_trees_all_equal(mine.weights, other.weights)
 
 
+def test_a_run_goes_on_in_the_variants_that_it_began_in(whole, tmp_path):
+    _, run, _ = whole
+    varied = dataclasses.replace(run.task, variants_version="abc")
+    Run(tmp_path, run.config, varied).save()
+    Run(tmp_path, run.config, varied)
+    with pytest.raises(ValueError, match="trained in variants abc, these are None"):
+        Run(tmp_path, run.config, run.task)
+
+
 def test_the_history_holds_the_parameters_at_each_point(whole):
     folder, run, rows = whole
     kept = [history.read(path) for path in history.points(folder)]

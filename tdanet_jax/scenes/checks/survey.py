@@ -97,6 +97,23 @@ def summary(tables: SceneTables) -> Iterator[str]:
         yield f"  {target}: {reason}: {', '.join(names)}"
 
 
+def making(rooms: Rooms) -> Iterator[str]:
+    """A line on how the rooms were made, if they are variants."""
+    if rooms.extras is not None and rooms.extras.made:
+        yield "Made by " + ", ".join(f"{name} {value}" for name, value in rooms.extras.made.items())
+
+
+def without_targets(tables: SceneTables) -> list[str]:
+    """The rooms in which no target of their type can be found."""
+    split = assign_rooms(make_split("22/0"), Rooms(tables, None))
+    asked = np.array(
+        [[t in split.seen[room] for t in tables.targets] for room in tables.room_types]
+    )
+    found = (tables.reachable & asked[tables.position_room_type]).any(axis=1)
+    full = np.bincount(tables.position_scene, found, len(tables.scenes)) > 0
+    return [name for name, holds in zip(tables.scenes, full, strict=True) if not holds]
+
+
 def uses(rooms: Rooms) -> Iterator[str]:
     """Lines on what rooms can be used for and what they need.
 

@@ -1,0 +1,128 @@
+"""The tables of variants of training rooms, built once per machine: what `--variants` trains in."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+
+import tdanet_jax
+from tdanet_jax.io import assets
+from tdanet_jax.scenes import cache, ithor, tabulation
+from tdanet_jax.scenes.checks import survey
+from tdanet_jax.scenes.dataset import Extras, Rooms
+from tdanet_jax.scenes.placement import statistics
+from tdanet_jax.scenes.records import of_scenes
+from tdanet_jax.scenes.scene import Scene
+from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.scenes.tabulation import Progress
+from tdanet_jax.scenes.vary import vary
+
+#: The seed of the variants in training: the same for all seeds of a run, which thus share them.
+SEED = 0
+
+_MODULES = tuple(
+    f"scenes.{name}" for name in ("reachable", "placement", "furniture", "vary", "variants")
+)
+
+
+def source(rooms: Rooms, names: Sequence[str]) -> str:
+    """Hash of all that variants follow from but their numbers and seed, 16 hex digits.
+
+    Args:
+      names: the rooms from which the statistics are.
+    """
+    records = {} if rooms.records is None else rooms.records
+    content = assets.sha256(assets.path(ithor.ASSET)) if rooms.extras is None else ""
+    return cache.source_hash(
+        (*cache.MODULES, *_MODULES),
+        content,
+        rooms.tables.data_version,
+        *(hashlib.sha256(records[name].tobytes()).hexdigest() for name in sorted(records)),
+        json.dumps([*names, *rooms.tables.targets]),
+    )
+
+
+def make(
+    rooms: Rooms,
+    names: Sequence[str],
+    known: Sequence[str],
+    copies: int,
+    seed: int,
+    progress: Progress | None = None,
+) -> Rooms:
+    """Variants 1 to `copies` of some rooms, room by room, with a note on how they were made.
+
+    Those in which no target can be found are left out.
+
+    Args:
+      names: the rooms.
+      known: the training rooms from which the statistics are.
+      progress: called with (variants done, variants in all).
+
+    Raises:
+      SceneError: the rooms do not say what lies on what, or there are too many of them.
+    """
+    usual, varied = statistics(rooms.scenes(known)), list[Scene]()
+    for scene in rooms.scenes(names):
+        for copy in range(1, copies + 1):
+            varied.append(vary(scene, usual, seed, copy))
+            if progress is not None:
+                progress(len(varied) / 3, len(names) * copies)
+
+    def report(done: float, total: int) -> None:
+        if progress is not None:
+            progress((total + 2 * done) / 3, total)
+
+    classes, targets = rooms.tables.classes, rooms.tables.targets
+    tables = tabulation.build(varied, classes, targets, progress=report)
+    if empty := survey.without_targets(tables):
+        varied = [scene for scene in varied if scene.name not in empty]
+        tables = tables.subset([scene.name for scene in varied])
+    extras = Extras(
+        parts={scene.name: scene.part for scene in varied if scene.part is not None},
+        made={
+            "command": "vary",
+            "copies": copies,
+            "seed": seed,
+            "source": source(rooms, known),
+            "rooms": rooms.tables.data_version,
+            "version": tdanet_jax.__version__,
+        },
+    )
+    return Rooms(tables, extras, records=of_scenes(varied))
+
+
+def load(
+    rooms: Rooms, names: Sequence[str], copies: int, progress: Progress | None = None
+) -> SceneTables:
+    """The tables of variants 1 to `copies` of some training rooms, from the cache or built.
+
+    Args:
+      names: the rooms. Statistics come from them alone.
+      progress: called with (variants done, variants in all) while any are built.
+
+    Raises:
+      SceneError: the rooms do not say what lies on what.
+    """
+    key = source(rooms, names)
+    scenes: list[Scene] = []
+    parts: list[SceneTables] = []
+
+    def build() -> SceneTables:
+        if not scenes:
+            scenes.extend(rooms.scenes(names))
+        known = statistics(scenes)
+
+        def report(done: float, total: int) -> None:
+            if progress is not None:
+                progress((copy - 1) * total + done, copies * total)
+
+        report(0.0, len(scenes))
+        varied = [vary(scene, known, SEED, copy) for scene in scenes]
+        tables = rooms.tables
+        return tabulation.build(varied, tables.classes, tables.targets, progress=report)
+
+    for copy in range(1, copies + 1):
+        parts.append(cache.load_or_build(f"{cache.VARIANTS}{key}-{copy}", build))
+    return tabulation.join(parts, rooms.tables.classes)
