@@ -220,7 +220,11 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
       results: as `saved_networks.Evaluated.results` gives them.
       runs: a short name for each; points of one run, which are not averaged, share one.
     """
-    lines = [f"# {in_markdown(title)}", "", "SR and SPL in percent, test rooms."]
+    lines = [
+        f"# {in_markdown(title)}",
+        "",
+        "SR and SPL in percent, test rooms. " + metrics.COLLISION_FREE,
+    ]
     departures = results[0].get("departures") if results else None  # all are played alike
     if departures:
         lines += ["", f"**{in_markdown(describe_departures(departures))}.**"]

@@ -9,6 +9,8 @@ import numpy as np
 
 #: Success rate and SPL; and with each episode in which a MoveAhead was blocked counted as failed.
 MEASURES = ("SR", "SPL", "CF-SR", "CF-SPL")
+#: What reports say of the last two.
+COLLISION_FREE = "CF-SR and CF-SPL count episodes in which a MoveAhead was blocked as failed."
 #: What `summarise` takes, by the names of columns.
 COLUMNS = ("success", "shortest", "length", "cluster", "collided")
 #: The two groups of episodes that the literature reports: L at least 1, and at least 5.
@@ -27,7 +29,7 @@ def summarise(
     shortest: np.ndarray,
     length: np.ndarray,
     cluster: np.ndarray,
-    collided: np.ndarray,
+    collided: np.ndarray | None = None,
 ) -> dict[str, dict[str, object]]:
     """SR and SPL in percent, per bucket of L.
 
@@ -37,7 +39,7 @@ def summarise(
       length: [E] e, including Done.
       cluster: [E] int, the (room, target) pair of each episode. Episodes of a pair are correlated,
         so the intervals resample pairs, not episodes.
-      collided: [E] bool, whether a MoveAhead was blocked.
+      collided: [E] bool, whether a MoveAhead was blocked; without it, CF-SR and CF-SPL are missing.
 
     Returns:
       bucket -> each of `MEASURES`, its interval (SR_ci, [low, high]), and n; None where n is 0.
@@ -62,39 +64,40 @@ def difference(
       As `summarise`, in percentage points.
     """
     mine, other = (
-        _rates(*(column[name] for name in ("success", "shortest", "length", "collided")))
+        _rates(*(column.get(name) for name in ("success", "shortest", "length", "collided")))
         for column in (ours, theirs)
     )
     return _averages(mine - other, theirs["shortest"], theirs["cluster"])
 
 
 def _rates(
-    success: np.ndarray, shortest: np.ndarray, length: np.ndarray, collided: np.ndarray
+    success: np.ndarray, shortest: np.ndarray, length: np.ndarray, collided: np.ndarray | None
 ) -> np.ndarray:
-    """Each of `MEASURES` of each episode in percent, [4, E]."""
-    free = success & ~collided
-    parts = [each for won in (success, free) for each in (won, spl(won, shortest, length))]
+    """Each of `MEASURES` of each episode in percent, [4, E]; [2, E] if collisions are unknown."""
+    wins = [success] if collided is None else [success, success & ~collided]
+    parts = [each for won in wins for each in (won, spl(won, shortest, length))]
     return 100.0 * np.stack(parts).astype(np.float64)
 
 
 def _averages(
     values: np.ndarray, shortest: np.ndarray, cluster: np.ndarray
 ) -> dict[str, dict[str, object]]:
-    """Means and intervals of the `MEASURES` of each episode [4, E], per bucket of L."""
+    """Means and intervals of the first M of `MEASURES` of each episode [M, E], per bucket of L."""
+    measures = MEASURES[: len(values)]
     out: dict[str, dict[str, object]] = {}
     for name, least in BUCKETS.items():
         chosen = shortest >= least
         count = int(chosen.sum())
         if count == 0:
-            nothing = (*MEASURES, *(f"{measure}_ci" for measure in MEASURES))
+            nothing = (*measures, *(f"{measure}_ci" for measure in measures))
             out[name] = {**dict.fromkeys(nothing), "n": 0}
             continue
         low, high = cluster_interval(values[:, chosen], cluster[chosen])
         mean = values[:, chosen].mean(axis=1)
         ends = zip(map(_round, low), map(_round, high), strict=True)
         out[name] = {
-            **dict(zip(MEASURES, map(_round, mean), strict=True)),
-            **{f"{m}_ci": [*both] for m, both in zip(MEASURES, ends, strict=True)},
+            **dict(zip(measures, map(_round, mean), strict=True)),
+            **{f"{m}_ci": [*both] for m, both in zip(measures, ends, strict=True)},
             "n": count,
         }
     return out
@@ -140,7 +143,7 @@ def grouped(
     for name in names:
         chosen = columns[key] == name
         if chosen.any():
-            out[name] = summarise(*(columns[c][chosen] for c in COLUMNS))
+            out[name] = summarise(*(columns[c][chosen] for c in COLUMNS if c in columns))
     return out
 
 

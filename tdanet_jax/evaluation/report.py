@@ -16,7 +16,15 @@ import tdanet_jax
 from tdanet_jax.config import TrainConfig, describe_departures
 from tdanet_jax.evaluation import paper
 from tdanet_jax.evaluation.episodes import Episodes
-from tdanet_jax.evaluation.metrics import BUCKETS, COLUMNS, MEASURES, grouped, shown, summarise
+from tdanet_jax.evaluation.metrics import (
+    BUCKETS,
+    COLLISION_FREE,
+    COLUMNS,
+    MEASURES,
+    grouped,
+    shown,
+    summarise,
+)
 from tdanet_jax.evaluation.rollout import Records
 from tdanet_jax.io import files
 from tdanet_jax.io.escaping import in_markdown
@@ -244,8 +252,8 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
         *(["", f"**{in_markdown(describe_departures(departures))}.**", ""] if departures else []),
         *(f"{n.capitalize()}: {in_markdown(out[n])}." for n in ("data", "image") if out[n]),
         "",
-        "SR and SPL in percent, with 95 % bootstrap intervals over (room, target) pairs. CF-SR and "
-        "CF-SPL count episodes in which a MoveAhead was blocked as failed.",
+        "SR and SPL in percent, with 95 % bootstrap intervals over (room, target) pairs. "
+        + COLLISION_FREE,
         "",
         *_header("Targets", "Agent"),
     ]

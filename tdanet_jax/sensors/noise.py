@@ -10,7 +10,6 @@ Axes: K detections of the tables, R = K + SPARE rows of a noisy frame, A known c
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -295,6 +294,3 @@ def _normal(bits: jax.Array) -> jax.Array:
     whole = bits.astype(jnp.int32)
     total = (whole & 15) + (whole >> 4 & 15) + (whole >> 8 & 15) + (whole >> 12)
     return (total - 30).astype(jnp.float32) * jnp.float32(85.0**-0.5)
-
-
-assert NoiseLevels._fields == tuple(field.name for field in dataclasses.fields(SenseNoise))

@@ -122,7 +122,7 @@ def markdown(rows: Sequence[Mapping[str, Any]], policy: str) -> str:
         "",
         f"{policy} actions, scene tables {first['data_version']}, code {report.code_version()}. "
         "In percent, L >= 1; in brackets, the share of the same agent's figure without noise. "
-        "CF-SR and CF-SPL count episodes in which a MoveAhead was blocked as failed.",
+        + metrics.COLLISION_FREE,
     ]
     if first["departures"]:
         lines += ["", f"**{in_markdown(describe_departures(first['departures']))}.**"]
