@@ -90,6 +90,7 @@ def make_params(
         spec=dataclasses.replace(spec, grid=tables.grid),
         size_noise=size_noise,
         houses=bool((tables.room_type < 0).any()),
+        noise=None,
         **{name: jnp.asarray(v, jnp.int32) for name, v in pool.items()},
     )
 

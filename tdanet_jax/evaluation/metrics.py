@@ -64,7 +64,7 @@ def difference(
       As `summarise`, in percentage points.
     """
     mine, other = (
-        _rates(*(column.get(name) for name in ("success", "shortest", "length", "collided")))
+        _rates(column["success"], column["shortest"], column["length"], column.get("collided"))
         for column in (ours, theirs)
     )
     return _averages(mine - other, theirs["shortest"], theirs["cluster"])

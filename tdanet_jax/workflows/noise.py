@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from tdanet_jax import sense_noise
 from tdanet_jax.analysis import figures
@@ -28,7 +28,7 @@ PLAN = [
 
 def evaluate_noise(
     checkpoints: Sequence[Path | str],
-    policy: Literal["sample", "greedy"] = "sample",
+    policy: str = "sample",
     test: EvalConfig = OWN_TASK,
     seed: int | None = None,
     out: Path | str | None = None,
@@ -41,7 +41,7 @@ def evaluate_noise(
 
     Args:
       checkpoints: folders of runs.
-      policy: how actions are chosen.
+      policy: "sample" or "greedy", how actions are chosen.
       test: where the evaluation departs from the runs' own task; without noise.
       seed: of sampled actions; by default each run's own.
       out: folder for `noise.json`, `noise.md` and `noise.png`; None writes nothing.

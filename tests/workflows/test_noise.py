@@ -18,7 +18,7 @@ from tests.conftest import TINY, save_untrained
 
 PLAN = [
     (None, "0", NONE),
-    ("misses", "1", SenseNoise(misses=1.0)),
+    ("failed turns", "1", SenseNoise(failed_turns=1.0)),
     ("nothing", "0", NONE),
 ]
 
@@ -33,22 +33,22 @@ def test_a_sweep_compares_each_level_with_the_agent_without_noise(
     rows = noise.evaluate_noise(
         [run], "sample", test, out=out, plan=PLAN, on_network=lambda _, name: shown.append(name)
     )
-    clean, blind, again = rows
+    clean, stuck, again = rows
     official = tdanet_jax.evaluate(run, policy="sample", test=test)
     for group in ("seen", "unseen"):
         assert clean[group] == again[group] == official[group]
-        assert blind[group] != clean[group]
-        change = blind["change"][group]["L>=1"]["SPL"]
-        points = blind[group]["L>=1"]["SPL"] - clean[group]["L>=1"]["SPL"]
+        assert stuck[group] != clean[group]
+        change = stuck["change"][group]["L>=1"]["SPL"]
+        points = stuck[group]["L>=1"]["SPL"] - clean[group]["L>=1"]["SPL"]
         assert change == pytest.approx(points, abs=0.011)
         assert not any(again["change"][group]["L>=1"][m] for m in ("SR", "CF-SPL"))
     assert json.loads((out / "noise.json").read_text()) == rows
     assert (out / "noise.png").stat().st_size > 1000
     page = (out / "noise.md").read_text()
-    assert "## Misses" in page
+    assert "## Failed turns" in page
     assert "| 1 | my\\_run | " in page
     assert "at most 40 actions" in page
-    assert shown[1] == "my_run, misses 1"
+    assert shown[1] == "my_run, failed turns 1"
 
 
 @pytest.mark.parametrize("other", [["--history", "--checkpoint", "x"], ["--policy", "random"]])
