@@ -319,17 +319,17 @@ def test_a_failed_turn_turns_what_the_agent_believes_alone(some_rooms: SceneTabl
     assert int(out.state.sensors["odometry"].heading) == 1
 
 
-def test_jit_is_eager_and_vmap_a_loop(some_rooms: SceneTables) -> None:
-    params = rooms_of(some_rooms, "mix")
-    keys = jax.random.split(jax.random.key(3), 3)
-    state = jax.vmap(dynamics.reset_state, (0, None))(keys, params)
-    action = jnp.array([0, 2, 3])
-    out = jax.jit(jax.vmap(dynamics.transition, (0, 0, None)))(state, action, params)
-    together = jax.vmap(dynamics.observe, (0, None))(out.state, params)
-    for i in range(2):
-        begun, expected = jax.tree.map(lambda x, i=i: x[i], (state, together))
-        alone = dynamics.observe(dynamics.transition(begun, action[i], params).state, params)
-        chex.assert_trees_all_close(alone, expected, atol=1e-5)
+def test_jit_is_eager_and_vmap_a_loop() -> None:
+    seen, corners = frame_of(TABLE[:K])
+    bits = jax.random.bits(jax.random.key(1), (3, 8, K + SPARE + 1), jnp.uint16)
+    own = episode({**dict.fromkeys(NAMES, 0.1), "false_positives": 2.0})
+    together = jax.vmap(detect, (None, None, 0, None))(seen, corners, bits, own)
+    slips = jax.jit(jax.vmap(noise.slip, (0, None)))(bits, own)
+    for i in range(3):
+        alone = noise.detect(seen, corners, bits[i], own, PARAMS, ROW_CLASS)
+        one, slipped = jax.tree.map(lambda x, i=i: x[i], (together, slips))
+        chex.assert_trees_all_close(alone, one, atol=1e-6)
+        chex.assert_trees_all_close(noise.slip(bits[i], own), slipped, atol=1e-6)
 
 
 @chex.assert_max_traces(1)

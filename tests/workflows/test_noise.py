@@ -46,7 +46,7 @@ def test_a_sweep_compares_each_level_with_the_agent_without_noise(
     assert (out / "noise.png").stat().st_size > 1000
     page = (out / "noise.md").read_text()
     assert "## Failed turns" in page
-    assert "| 1 | my\\_run | " in page
+    assert "| 1 | my_run | " in page
     assert "at most 40 actions" in page
     assert shown[1] == "my_run, failed turns 1"
 
