@@ -240,7 +240,7 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
 def print_summary(results: Mapping[str, Any]) -> None:
     """One line per group: seen targets, 1000 episodes: SR 75.1 (70.2 to 80.0), SPL ..."""
     from tdanet_jax.config import describe_departures
-    from tdanet_jax.evaluation.metrics import shown
+    from tdanet_jax.evaluation.metrics import MEASURES, shown
 
     if results.get("departures"):
         console.print(describe_departures(results["departures"]))
@@ -248,5 +248,5 @@ def print_summary(results: Mapping[str, Any]) -> None:
         if results[group] is None:
             continue
         bucket = results[group]["L>=1"]
-        parts = [f"{name} {shown(bucket, name)}" for name in ("SR", "SPL")]
+        parts = [f"{name} {shown(bucket, name)}" for name in MEASURES if name in bucket]
         console.print(f"{group} targets, {bucket['n']} episodes: {', '.join(parts)}")

@@ -3,10 +3,12 @@
     python -m experiments.evaluate --checkpoint runs/... --policy greedy
     python -m experiments.evaluate --checkpoint runs/... --history
     python -m experiments.evaluate --checkpoint runs/a --checkpoint runs/b --out compared
+    python -m experiments.evaluate --checkpoint runs/... --noise sweep
     python -m experiments.evaluate --policy random --split 18/4 --out random
 
 Writes results.json, results.md and episodes.jsonl for one agent; for several checkpoints or a
 history, evaluations.json, evaluations.md, episodes.jsonl and, of a history, learning_curve.png.
+With --noise sweep: noise.json, noise.md and noise.png.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import tyro
 from experiments.console import console, fail, one_line_errors, parse, print_summary, reporter
 from tdanet_jax.config import OWN_TASK, EvalConfig, TrainConfig
 from tdanet_jax.io import files
+from tdanet_jax.sense_noise import SWEEP
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +49,8 @@ class Command:
     ended with; 0 for the policies that need no checkpoint."""
     out: Path | None = None
     """Folder to write; must be new or empty. By default <checkpoint>/<policy> for one checkpoint,
-    <checkpoint>/history-<policy> for its history, runs/<policy> without one."""
+    <checkpoint>/history-<policy> for its history, <checkpoint>/noise-<policy> for a sweep over
+    noise, runs/<policy> without one."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -68,17 +72,37 @@ def main(arguments: list[str] | None = None) -> None:
             fail("--checkpoint: a run is given twice")
         if len(command.checkpoint) > 1 and command.out is None:
             fail("several checkpoints need --out")
+        sweep = command.test.noise == SWEEP
+        if sweep and (not trained or command.history):
+            fail("--noise sweep: plays the newest networks of runs, without --history")
         config = TrainConfig(
             split=TrainConfig().split if command.split is None else command.split,
             validation=command.validation,
             seed=command.seed or 0,
         )
         config.check()
-        command.test.check()
-        kind = f"history-{command.policy}" if command.history else command.policy
+        test = dataclasses.replace(command.test, noise=None) if sweep else command.test
+        test.check()
+        kind = f"noise-{command.policy}" if sweep else command.policy
+        kind = f"history-{command.policy}" if command.history else kind
         folder = command.out or (*command.checkpoint, Path("runs"))[0] / kind
         files.check_empty(folder)
-        play(command, config, folder)
+        if sweep:
+            play_noise(command, test, folder)
+        else:
+            play(command, config, folder)
+
+
+def play_noise(command: Command, test: EvalConfig, folder: Path) -> None:
+    """Plays the episodes at five levels of each kind of noise and writes the report."""
+    from tdanet_jax.training import devices
+    from tdanet_jax.workflows.noise import evaluate_noise
+
+    devices.keep_compiled()
+    devices.start()
+    with reporter("evaluating") as show:
+        evaluate_noise(command.checkpoint, command.policy, test, command.seed, folder, show)
+    console.print(f"wrote {folder / 'noise.md'}")
 
 
 def play(command: Command, config: TrainConfig, folder: Path) -> None:

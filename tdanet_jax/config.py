@@ -10,10 +10,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+from tdanet_jax import sense_noise
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import FileError, jsons, regular
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.registry import MODELS, SENSORS
+from tdanet_jax.sense_noise import SenseNoise
 from tdanet_jax.splits import OPEN, file_name, make_split, split_name
 from tdanet_jax.targets import PAPER as PAPER_TARGETS
 from tdanet_jax.targets import canonical, known_classes
@@ -70,6 +72,9 @@ class LearnerConfig:
     size_noise: float = 0.0
     """Augmentation: scales the target's box sides by a per-episode factor, log-uniform in
     [e^-x, e^x], so that the policy cannot rely on apparent size. Not in the paper."""
+    noise: str = "none"
+    """Senses that err in training: none, detector, wheels, mix, or levels such as
+    misses=0:0.3,jitter=0.1. From a range, each episode draws its own level (docs/noise.md)."""
     bootstrap_truncated: bool = True
     """Bootstrap the return from the last state's value when an episode times out. False treats a
     time-out as termination, as the reference does."""
@@ -195,6 +200,7 @@ class TrainConfig:
                     raise ValueError(f"--{name.replace('_', '-')} {values[name]}: must {wanted}")
         if self.network.image == "features" and self.data is None:
             raise ValueError("--image features: needs --data, rooms that were imported with them")
+        sense_noise.parse(self.learner.noise)
         self.network.spec.check()
 
     def normalised(self) -> TrainConfig:
@@ -256,18 +262,29 @@ class EvalConfig:
     """Play only the test episodes in these rooms, such as FloorPlan228."""
     targets: tuple[str, ...] = ()
     """Play only the test episodes with these targets, such as Laptop."""
+    noise: str | None = None
+    """Senses that err: detector, wheels, mix, or levels such as misses=0.2,jitter=0.1
+    (docs/noise.md). The command also takes sweep: five levels of each kind of noise."""
 
     def check(self) -> None:
         """Raises ValueError, with one line that names the flag, if a value is out of range."""
         for name, value in (("step-limit", self.step_limit), ("episodes", self.episodes)):
             if value is not None and (not _fits(value, int) or value < 1):
                 raise ValueError(f"--{name} {value}: must be a positive integer")
+        sense_noise.parse(self.noise or "none")
+
+    @property
+    def senses(self) -> SenseNoise:
+        """The noise of the senses. Raises ValueError if it is not given as it must be."""
+        return sense_noise.parse(self.noise or "none")
 
     @property
     def departures(self) -> dict[str, Any]:
         """The values, by name, for which this is not the official test; none if it is."""
         values = {name: getattr(self, name) for name in ("step_limit", "episodes")}
         values |= {name: list(getattr(self, name)) for name in ("scenes", "targets")}
+        if self.senses.any:
+            values["noise"] = str(self.senses)
         return {name: value for name, value in values.items() if value}
 
     def locate(self, config: TrainConfig, run: Path | str) -> TrainConfig:
@@ -301,9 +318,16 @@ def describe_departures(departures: Mapping[str, Any]) -> str:
         "episodes": "at most {} episodes of each list, evenly spaced",
         "scenes": "only in {}",
         "targets": "only for {}",
+        "noise": "senses that err, {}",
     }
     parts = [
-        text.format(", ".join(value) if isinstance(value, list) else f"{value:,}")
+        text.format(
+            ", ".join(value)
+            if isinstance(value, list)
+            else f"{value:,}"
+            if isinstance(value, int)
+            else value
+        )
         for name, text in texts.items()
         if (value := departures.get(name))
     ]

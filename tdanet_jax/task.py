@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from tdanet_jax import sense_noise
 from tdanet_jax import words as word_vectors
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.env import reward, zero_shot
 from tdanet_jax.env.environment import Environment
-from tdanet_jax.env.params import FeatureMaps, limits_of_tests, make_params
+from tdanet_jax.env.params import FeatureMaps, limits_of_tests, make_params, with_noise
 from tdanet_jax.env.reward import Parents
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.models import class_graph
@@ -216,15 +217,20 @@ def make_task(
         split=split,
         classes=classes,
         model=model,
-        train_params=make_params(
+        train_params=with_noise(
+            make_params(
+                seen_rooms,
+                split.seen,
+                parents if rewarded == "parents" else reward.no_parents(seen_rooms),
+                [config.learner.step_limit] * len(tables.room_types),
+                model.spec,
+                similarity=similarity,
+                features=train_maps,
+                size_noise=config.learner.size_noise,
+            ),
             seen_rooms,
-            split.seen,
-            parents if rewarded == "parents" else reward.no_parents(seen_rooms),
-            [config.learner.step_limit] * len(tables.room_types),
-            model.spec,
-            similarity=similarity,
-            features=train_maps,
-            size_noise=config.learner.size_noise,
+            sense_noise.parse(config.learner.noise),
+            train_words,
         ),
         eval_params=make_params(
             tables,

@@ -103,6 +103,46 @@ def evaluated_curves(curves: Sequence[Curve], title: str, path: Path) -> None:
     drawing.save(figure, path, DPI)
 
 
+def noise(rows: Sequence[dict[str, Any]], title: str, path: Path) -> None:
+    """SR and SPL against the level of each kind of noise; seen targets solid, unseen ones dashed.
+
+    Args:
+      rows: as `workflows.noise.evaluate_noise` gives them; the first of each agent is without
+        noise.
+    """
+    kinds = [*dict.fromkeys(row["kind"] for row in rows if row["kind"] is not None)]
+    agents = [*dict.fromkeys(row["agent"] for row in rows)]
+    columns = 3
+    lines = -(-len(kinds) // columns)
+    figure = Figure(figsize=(15, 2.2 * lines + 1), layout="constrained")
+    axes = figure.subplots(lines, 2 * columns, sharey=True, squeeze=False).reshape(-1, 2)
+    for pair, kind in zip(axes, kinds, strict=False):
+        for axis, measure in zip(pair, MEASURES, strict=True):
+            for i, agent in enumerate(agents):
+                own = [r for r in rows if r["agent"] == agent and r["kind"] in (None, kind)]
+                for group in (group for group in GROUPS if own[0][group] is not None):
+                    seen, color = group == "seen", PALETTE[i % len(PALETTE)]
+                    axis.plot(
+                        [row["level"] for row in own],
+                        [row[group]["L>=1"][measure] for row in own],
+                        "-" if seen else "--", color=color, marker=MARKERS[i % len(MARKERS)],
+                        markersize=3, markerfacecolor=color if seen else "white",
+                        label=in_figure(f"{agent}, {group}"),
+                    )  # fmt: skip
+            axis.set_title(f"{measure}: {kind}", fontsize=9)
+            axis.set(ylim=(0, 100))
+            axis.tick_params(labelsize=8)
+            axis.grid(alpha=0.3)
+            axis.spines[["top", "right"]].set_visible(False)
+    for pair in axes[len(kinds) :]:
+        for axis in pair:
+            axis.set_visible(False)
+    figure.suptitle(_in_lines(title))
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    drawing.save(figure, path, DPI)
+
+
 def _in_lines(title: str) -> str:
     """A title over two panels; the name of a split may be longer than they are wide."""
     return textwrap.fill(in_figure(re.sub(r",(?! )", ", ", title)), 90)

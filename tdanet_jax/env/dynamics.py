@@ -13,9 +13,10 @@ import jax.numpy as jnp
 
 from tdanet_jax.env.reward import DONE_REWARD, SIMILARITY_SHARE, STEP_REWARD
 from tdanet_jax.env.types import EnvParams, EnvState, Observation, Outcome
-from tdanet_jax.sensors import odometry, suite
+from tdanet_jax.sensors import noise, odometry, suite
+from tdanet_jax.sensors.noise import Detections
 from tdanet_jax.sensors.sensor import Frame, Motion, Start
-from tdanet_jax.vocabulary import Action
+from tdanet_jax.vocabulary import NUM_ACTIONS, Action
 
 
 def _pick(bits: jax.Array, count: jax.Array | int) -> jax.Array:
@@ -30,9 +31,21 @@ def _pick_from(bits: jax.Array, span: jax.Array) -> jax.Array:
 
 
 def start(
-    pose: jax.Array, target: jax.Array, params: EnvParams, area_factor: jax.Array | None = None
+    pose: jax.Array,
+    target: jax.Array,
+    params: EnvParams,
+    area_factor: jax.Array | None = None,
+    noise_key: jax.Array | None = None,
 ) -> EnvState:
-    """The state at the start of the given episode."""
+    """The state at the start of the given episode.
+
+    Args:
+      pose: where it starts.
+      target: index of what to look for.
+      params: the environment.
+      area_factor: of the target's boxes, if there is size noise.
+      noise_key: for what an episode's senses get wrong, if they err; None is one fixed key.
+    """
     zero = jnp.zeros_like(pose)
     position, rotation, horizon = params.grid.split(pose)
     shortest = params.distance[pose, target].astype(jnp.int32) + 1
@@ -45,8 +58,13 @@ def start(
         similarity=None if params.similarity is None else jnp.zeros_like(pose, jnp.float32),
         area_factor=area_factor,
         room=params.position_room[position] if params.houses else None,
+        noise=None
+        if params.noise is None
+        else noise.begin(jax.random.key(0) if noise_key is None else noise_key, params.noise),
     )
-    begun = suite.init(params.spec, Start(rotation, horizon))
+    bits = _noise_bits(state, params)
+    slip = None if bits is None or state.noise is None else noise.slip(bits, state.noise)
+    begun = suite.init(params.spec, Start(rotation, horizon, slip))
     return state.replace(sensors=suite.observe(params.spec, begun, _frame(state, params)))
 
 
@@ -64,7 +82,8 @@ def reset_state(key: jax.Array, params: EnvParams) -> EnvState:
     rotation = _draw_rotation(bits, params.grid.rotations)
     factor = _draw_area_factor(key, params.size_noise) if params.size_noise else None
     pose = params.grid.look_level(position, rotation)
-    return start(pose, params.pair_target[pair], params, factor)
+    own = None if params.noise is None else jax.random.fold_in(key, 1)
+    return start(pose, params.pair_target[pair], params, factor, own)
 
 
 def _draw_rotation(bits: jax.Array, rotations: int) -> jax.Array:
@@ -99,15 +118,22 @@ def observe(state: EnvState, params: EnvParams) -> Observation:
         boxes=frame.boxes,
         mask=frame.mask,
         target=frame.target,
-        empty=~frame.mask[0],
+        empty=~frame.mask[0] if params.noise is None else ~jnp.any(frame.mask),
         cells=None if params.raster is None else params.raster[state.pose].astype(jnp.int32),
         features=features,
         sensors=suite.read(params.spec, state.sensors),
     )
 
 
+def _noise_bits(state: EnvState, params: EnvParams) -> jax.Array | None:
+    """The random bits of a step, if senses err."""
+    if state.noise is None:
+        return None
+    return noise.draw(state.noise, state.steps, params.max_detections)
+
+
 def _frame(state: EnvState, params: EnvParams) -> Frame:
-    """The detections in view, padded with zeros to K rows."""
+    """The detections that the agent is shown, padded with zeros."""
     target = params.target_class[state.target]
     first, last = params.row_start[state.pose], params.row_start[state.pose + 1]
     longest = params.max_detections
@@ -121,7 +147,16 @@ def _frame(state: EnvState, params: EnvParams) -> Frame:
         is_target = classes == target
         area = jnp.minimum(boxes[:, 2] * jnp.where(is_target, state.area_factor, 1.0), 1.0)
         boxes = boxes.at[:, 2].set(area)
-    return Frame(jnp.where(mask, classes, 0), boxes, mask, target)
+    classes = jnp.where(mask, classes, 0)
+    bits = _noise_bits(state, params)
+    if bits is not None and params.noise is not None and state.noise is not None:
+        flat = params.noise.corners.reshape(-1)
+        corners = jax.lax.dynamic_slice(flat, (4 * first,), (4 * longest,)).reshape(longest, 4)
+        seen = Detections(classes, boxes, mask)
+        classes, boxes, mask = noise.detect(
+            seen, corners, bits, state.noise, params.noise, params.row_class
+        )
+    return Frame(classes, boxes, mask, target)
 
 
 def is_visible(pose: jax.Array, cls: jax.Array, params: EnvParams) -> jax.Array:
@@ -145,19 +180,25 @@ def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome
     the partial reward for what is in view, for a `Done` with the target visible.
     """
     action = jnp.asarray(action)  # of a Python int, `done` would be a Python bool
-    pose = move(state.pose, action, params)
+    steps = state.steps + 1
+    bits = _noise_bits(state.replace(steps=steps), params)
+    slip, moves = None, action
+    if bits is not None and state.noise is not None:
+        slip = noise.slip(bits, state.noise)
+        turns = (action == Action.ROTATE_LEFT) | (action == Action.ROTATE_RIGHT)
+        moves = jnp.where(turns & noise.turn_fails(bits, state.noise), NUM_ACTIONS, action)
+    pose = move(state.pose, moves, params)
     done = action == Action.DONE
     success = done & is_visible(pose, params.target_class[state.target], params)
     earns, partial, at_done, seen = _partial_reward(state, pose, params)
     reward = jnp.where(~done & earns, partial, STEP_REWARD)
     reward = jnp.where(success, DONE_REWARD + at_done, reward)
-    steps = state.steps + 1
     room = state.room
     if room is None:  # a scene has one type
         room = params.position_room[params.grid.split(pose).position]
     limit = params.step_limit[room.astype(jnp.int32)]
     after = seen.replace(pose=pose, steps=steps)
-    moved = suite.update(params.spec, after.sensors, Motion(action, pose == state.pose))
+    moved = suite.update(params.spec, after.sensors, Motion(action, pose == state.pose, slip))
     after = after.replace(sensors=suite.observe(params.spec, moved, _frame(after, params)))
     return Outcome(
         state=after,

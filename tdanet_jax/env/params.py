@@ -12,7 +12,8 @@ import numpy as np
 
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.observation_spec import ObservationSpec
-from tdanet_jax.sensors import detections
+from tdanet_jax.sense_noise import SenseNoise
+from tdanet_jax.sensors import detections, noise
 
 if TYPE_CHECKING:
     from tdanet_jax.env.reward import Parents
@@ -65,7 +66,7 @@ def make_params(
     Raises:
       ValueError: no episode is possible.
     """
-    start, classes, boxes = _detections(tables, spec.rows == "class")
+    start, classes, boxes, _ = _detections(tables, spec.rows == "class")
     longest = max(int(np.diff(start).max(initial=0)), 1)
     pad = (0, longest)  # rows after the last pose, so that a window of K never leaves the table
     pool = _episode_pool(tables, targets, tables.scenes if scenes is None else scenes)
@@ -89,12 +90,37 @@ def make_params(
         spec=dataclasses.replace(spec, grid=tables.grid),
         size_noise=size_noise,
         houses=bool((tables.room_type < 0).any()),
+        noise=None,
         **{name: jnp.asarray(v, jnp.int32) for name, v in pool.items()},
     )
 
 
-def _detections(tables: SceneTables, merge: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Detections of all poses: start [S + 1], class [N] and (x, y, S) [N, 3] float32.
+def with_noise(
+    params: EnvParams, tables: SceneTables, levels: SenseNoise, words: np.ndarray
+) -> EnvParams:
+    """The same environment with senses that err; unchanged if no level can be above 0.
+
+    Args:
+      params: what `make_params` made of the tables.
+      tables: the rooms. Noise shows only classes that occur in them as detections.
+      levels: of the noise.
+      words: [C, D] word vectors, from which similar classes are found.
+    """
+    if not levels.any:
+        return params
+    merge = params.spec.rows == "class"
+    _, classes, _, corners = _detections(tables, merge)
+    names = tables.classes
+    model = noise.make_params(
+        levels, corners, classes, words, names, params.max_detections, one_per_class=merge
+    )
+    return params.replace(noise=model)
+
+
+def _detections(
+    tables: SceneTables, merge: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Detections of all poses: start [S + 1], class [N], (x, y, S) [N, 3] float32, extent [N, 4].
 
     With `merge`, a class's instances are one row (`detections.merge_classes`).
     """
@@ -106,9 +132,12 @@ def _detections(tables: SceneTables, merge: bool) -> tuple[np.ndarray, np.ndarra
         key = tables.row_state[boxed].astype(np.int64) * len(tables.classes) + classes
         first, rows = detections.merge_classes(key, corners)
         start, classes = np.searchsorted(first, start), classes[first]
+        if len(first):
+            least = np.minimum.reduceat(corners[:, :2], first)
+            corners = np.hstack([least, np.maximum.reduceat(corners[:, 2:], first)])
     else:
         rows = detections.centre_and_area(corners)
-    return start, classes, rows.astype(np.float32)
+    return start, classes, rows.astype(np.float32), corners
 
 
 def _episode_pool(

@@ -14,6 +14,7 @@ from flax import struct
 
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.poses import PoseGrid
+from tdanet_jax.sensors.noise import EpisodeNoise, NoiseParams
 
 #: Rows and columns of the class raster, the size of a ResNet-18 feature map.
 RASTER = (7, 7)
@@ -49,6 +50,7 @@ class EnvParams(struct.PyTreeNode):
     spec: ObservationSpec = struct.field(pytree_node=False, default=ObservationSpec())
     size_noise: float = struct.field(pytree_node=False, default=0.0)  # LearnerConfig.size_noise
     houses: bool = struct.field(pytree_node=False, default=False)  # scenes of several room types
+    noise: NoiseParams | None = None  # of senses that err (`params.with_noise`)
 
     @property
     def grid(self) -> PoseGrid:
@@ -68,10 +70,14 @@ class EnvState(struct.PyTreeNode):
     area_factor: jax.Array | None = None  # float32, of the target's boxes, if there is size noise
     room: jax.Array | None = None  # int8, room type of the start, if there are houses
     sensors: Mapping[str, Any] = struct.field(default_factory=dict)  # states of the sensors by name
+    noise: EpisodeNoise | None = None  # of senses that err
 
 
 class Observation(struct.PyTreeNode):
-    """What the agent perceives. A frame without detections is one all-zero row."""
+    """What the agent perceives. A frame without detections is one all-zero row.
+
+    With noise, K is larger by `tdanet_jax.sensors.noise.SPARE`, and padding lies anywhere.
+    """
 
     classes: jax.Array  # [K] int32, class of each detection; 0 in padding
     boxes: jax.Array  # [K, 3] float32, x, y, S

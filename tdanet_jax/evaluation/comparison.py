@@ -23,6 +23,7 @@ from tdanet_jax.splits import GROUPS
 Result = Mapping[str, Any]
 #: The records of a network by group, as the columns of `report.columns`.
 Columns = Mapping[str, Mapping[str, np.ndarray]]
+#: What learning curves show.
 MEASURES = ("SR", "SPL")
 #: Flags of sensors, which the paper's agents do not have.
 BEYOND = ("--odometry", "--triangulation", "--sensors")
@@ -133,7 +134,8 @@ def _groups(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         found = [part[group] for part in parts if part.get(group) is not None]
         out[group] = {
             bucket: {
-                measure: spread(part[bucket][measure] for part in found) for measure in MEASURES
+                measure: spread(part[bucket].get(measure) for part in found)
+                for measure in metrics.MEASURES
             }
             for bucket in BUCKETS
         } if found else None  # fmt: skip
@@ -184,13 +186,13 @@ def _same_episodes(
 def table(
     first: Sequence[str], rows: Iterable[tuple[Sequence[str], Mapping[str, Any]]]
 ) -> list[str]:
-    """A table as in the paper: SR and SPL of seen and unseen targets, L >= 1 and L >= 5.
+    """A table as in the paper: the measures of seen and unseen targets, L >= 1 and L >= 5.
 
     Args:
       first: headings of the columns before the results.
       rows: the cells of these columns, and group -> bucket -> measure -> a printable value.
     """
-    names = [f"{g} {m} {b}" for g in GROUPS for b in BUCKETS for m in MEASURES]
+    names = [f"{g} {m} {b}" for g in GROUPS for b in BUCKETS for m in metrics.MEASURES]
     heads = [*first, *names]
     lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
     for cells, groups in rows:
@@ -198,7 +200,7 @@ def table(
             _cell(((groups.get(group) or {}).get(bucket) or {}).get(measure))
             for group in GROUPS
             for bucket in BUCKETS
-            for measure in MEASURES
+            for measure in metrics.MEASURES
         ]
         lines.append(f"| {' | '.join([*cells, *figures])} |")
     return lines
@@ -218,7 +220,11 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
       results: as `saved_networks.Evaluated.results` gives them.
       runs: a short name for each; points of one run, which are not averaged, share one.
     """
-    lines = [f"# {in_markdown(title)}", "", "SR and SPL in percent, test rooms."]
+    lines = [
+        f"# {in_markdown(title)}",
+        "",
+        "SR and SPL in percent, test rooms. " + metrics.COLLISION_FREE,
+    ]
     departures = results[0].get("departures") if results else None  # all are played alike
     if departures:
         lines += ["", f"**{in_markdown(describe_departures(departures))}.**"]
@@ -255,7 +261,7 @@ def _differences(results: Sequence[Result], names: Sequence[str]) -> Iterator[_R
         to = next(n for r, n in zip(results, names, strict=True) if r["run"] == difference["to"])
         groups = {
             group: {
-                bucket: {measure: metrics.shown(part, measure) for measure in MEASURES}
+                bucket: {measure: metrics.shown(part, measure) for measure in metrics.MEASURES}
                 for bucket, part in difference[group].items()
             }
             for group in GROUPS

@@ -7,6 +7,12 @@ from typing import Any
 
 import numpy as np
 
+#: Success rate and SPL; and with each episode in which a MoveAhead was blocked counted as failed.
+MEASURES = ("SR", "SPL", "CF-SR", "CF-SPL")
+#: What reports say of the last two.
+COLLISION_FREE = "CF-SR and CF-SPL count episodes in which a MoveAhead was blocked as failed."
+#: What `summarise` takes, by the names of columns.
+COLUMNS = ("success", "shortest", "length", "cluster", "collided")
 #: The two groups of episodes that the literature reports: L at least 1, and at least 5.
 BUCKETS = {"L>=1": 1, "L>=5": 5}
 BOOTSTRAP_SAMPLES = 2_000
@@ -19,7 +25,11 @@ def spl(success: np.ndarray, shortest: np.ndarray, length: np.ndarray) -> np.nda
 
 
 def summarise(
-    success: np.ndarray, shortest: np.ndarray, length: np.ndarray, cluster: np.ndarray
+    success: np.ndarray,
+    shortest: np.ndarray,
+    length: np.ndarray,
+    cluster: np.ndarray,
+    collided: np.ndarray | None = None,
 ) -> dict[str, dict[str, object]]:
     """SR and SPL in percent, per bucket of L.
 
@@ -29,11 +39,13 @@ def summarise(
       length: [E] e, including Done.
       cluster: [E] int, the (room, target) pair of each episode. Episodes of a pair are correlated,
         so the intervals resample pairs, not episodes.
+      collided: [E] bool, whether a MoveAhead was blocked; without it, CF-SR and CF-SPL are missing.
 
     Returns:
-      bucket -> SR, SPL, SR_ci, SPL_ci (each [low, high]) and n; None where n is 0.
+      bucket -> each of `MEASURES`, its interval (SR_ci, [low, high]), and n; None where n is 0.
+      The collision-free measures, CF-SR and CF-SPL, count episodes that collided as failed.
     """
-    return _averages(_rates(success, shortest, length), shortest, cluster)
+    return _averages(_rates(success, shortest, length, collided), shortest, cluster)
 
 
 def difference(
@@ -45,42 +57,47 @@ def difference(
     episode that is hard for both does not widen the intervals.
 
     Args:
-      ours: `success`, `shortest`, `length` and `cluster` of the episodes (`summarise`).
+      ours: the `COLUMNS` of the episodes (`summarise`).
       theirs: the same of the other agent.
 
     Returns:
       As `summarise`, in percentage points.
     """
     mine, other = (
-        _rates(*(column[name] for name in ("success", "shortest", "length")))
+        _rates(column["success"], column["shortest"], column["length"], column.get("collided"))
         for column in (ours, theirs)
     )
     return _averages(mine - other, theirs["shortest"], theirs["cluster"])
 
 
-def _rates(success: np.ndarray, shortest: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Success and SPL of each episode in percent, [2, E]."""
-    return 100.0 * np.stack([success, spl(success, shortest, length)]).astype(np.float64)
+def _rates(
+    success: np.ndarray, shortest: np.ndarray, length: np.ndarray, collided: np.ndarray | None
+) -> np.ndarray:
+    """Each of `MEASURES` of each episode in percent, [4, E]; [2, E] if collisions are unknown."""
+    wins = [success] if collided is None else [success, success & ~collided]
+    parts = [each for won in wins for each in (won, spl(won, shortest, length))]
+    return 100.0 * np.stack(parts).astype(np.float64)
 
 
 def _averages(
     values: np.ndarray, shortest: np.ndarray, cluster: np.ndarray
 ) -> dict[str, dict[str, object]]:
-    """Means and intervals of two values of each episode [2, E], per bucket of L."""
+    """Means and intervals of the first M of `MEASURES` of each episode [M, E], per bucket of L."""
+    measures = MEASURES[: len(values)]
     out: dict[str, dict[str, object]] = {}
     for name, least in BUCKETS.items():
         chosen = shortest >= least
         count = int(chosen.sum())
         if count == 0:
-            out[name] = {"SR": None, "SPL": None, "SR_ci": None, "SPL_ci": None, "n": 0}
+            nothing = (*measures, *(f"{measure}_ci" for measure in measures))
+            out[name] = {**dict.fromkeys(nothing), "n": 0}
             continue
         low, high = cluster_interval(values[:, chosen], cluster[chosen])
         mean = values[:, chosen].mean(axis=1)
+        ends = zip(map(_round, low), map(_round, high), strict=True)
         out[name] = {
-            "SR": _round(mean[0]),
-            "SPL": _round(mean[1]),
-            "SR_ci": [_round(low[0]), _round(high[0])],
-            "SPL_ci": [_round(low[1]), _round(high[1])],
+            **dict(zip(measures, map(_round, mean), strict=True)),
+            **{f"{m}_ci": [*both] for m, both in zip(measures, ends, strict=True)},
             "n": count,
         }
     return out
@@ -126,8 +143,7 @@ def grouped(
     for name in names:
         chosen = columns[key] == name
         if chosen.any():
-            picked = (columns[c][chosen] for c in ("success", "shortest", "length", "cluster"))
-            out[name] = summarise(*picked)
+            out[name] = summarise(*(columns[c][chosen] for c in COLUMNS if c in columns))
     return out
 
 

@@ -16,7 +16,15 @@ import tdanet_jax
 from tdanet_jax.config import TrainConfig, describe_departures
 from tdanet_jax.evaluation import paper
 from tdanet_jax.evaluation.episodes import Episodes
-from tdanet_jax.evaluation.metrics import BUCKETS, grouped, shown, summarise
+from tdanet_jax.evaluation.metrics import (
+    BUCKETS,
+    COLLISION_FREE,
+    COLUMNS,
+    MEASURES,
+    grouped,
+    shown,
+    summarise,
+)
 from tdanet_jax.evaluation.rollout import Records
 from tdanet_jax.io import files
 from tdanet_jax.io.escaping import in_markdown
@@ -132,6 +140,7 @@ def columns(
         "shortest": records.shortest,
         "length": records.length,
         "success": records.success,
+        "collided": records.collided,
         "cluster": episodes.target.astype(np.int64) if by_class else pair,
         "pair": pair,
     }
@@ -169,7 +178,7 @@ def _results(
 
 
 def _summary(column: Columns) -> dict[str, dict[str, Any]]:
-    return summarise(*(column[name] for name in ("success", "shortest", "length", "cluster")))
+    return summarise(*(column[name] for name in COLUMNS))
 
 
 #: What `results.json` begins with.
@@ -201,6 +210,7 @@ def episode_rows(group: str, column: Columns, records: Records) -> list[dict[str
                 "L": int(records.shortest[i]),
                 "e": int(records.length[i]),
                 "success": bool(records.success[i]),
+                "collided": bool(records.collided[i]),
                 "actions": [ACTION_NAMES[a] for a in taken],
             }
         )
@@ -261,7 +271,8 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
         *(f"{n.capitalize()}: {in_markdown(out[n])}." for n in ("data", "image") if out[n]),
         "",
         "SR and SPL in percent, with 95 % bootstrap intervals over "
-        f"{'target classes' if is_open(out['split']) else '(room, target) pairs'}.",
+        f"{'target classes' if is_open(out['split']) else '(room, target) pairs'}. "
+        + COLLISION_FREE,
         "",
         *_header("Targets", "Agent"),
     ]
@@ -307,12 +318,12 @@ def _near_synonyms(column: Columns) -> list[str]:
 
 
 def _header(*first: str) -> list[str]:
-    names = [*first, *(f"{m} {bucket}" for bucket in BUCKETS for m in ("SR", "SPL", "n"))]
+    names = [*first, *(f"{m} {bucket}" for bucket in BUCKETS for m in (*MEASURES, "n"))]
     return [f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"]
 
 
 def _row(first: tuple[str, ...], buckets: Mapping[str, Mapping[str, Any]]) -> str:
     cells = [*first]
     for part in (buckets.get(bucket, {}) for bucket in BUCKETS):
-        cells += [shown(part, "SR"), shown(part, "SPL"), str(part.get("n", ""))]
+        cells += [*(shown(part, measure) for measure in MEASURES), str(part.get("n", ""))]
     return f"| {' | '.join(cells)} |"

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tdanet_jax.evaluation.metrics import BUCKETS
+from tdanet_jax.evaluation.metrics import BUCKETS, MEASURES
 from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.io.untrusted.jsons import number
 from tdanet_jax.splits import GROUPS, split_name
@@ -57,7 +57,7 @@ def check(path: Path, results: Any) -> None:
 
 
 def _check_groups(path: Path, groups: Any, where: str) -> None:
-    """Checks the results by group: SR, SPL and number of episodes, with intervals if there are."""
+    """Checks the results by group: measures and number of episodes, intervals if there are."""
     if not isinstance(groups, Mapping):
         raise FileError(path, f"{where}: not an object")
     for group in GROUPS:
@@ -68,7 +68,9 @@ def _check_groups(path: Path, groups: Any, where: str) -> None:
             if not isinstance(part, dict):
                 raise FileError(path, f"{place}: missing")
             number(path, part.get("n"), f"{place}, n", 1e9)
-            for measure in ("SR", "SPL"):
+            for measure in MEASURES:
+                if measure not in part and measure.startswith("CF-"):
+                    continue  # files from before these were measured
                 if measure not in part:
                     raise FileError(path, f"{place}, {measure}: missing")
                 if part[measure] is not None:

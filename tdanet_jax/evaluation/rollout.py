@@ -15,6 +15,7 @@ from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.policies import Policy
+from tdanet_jax.vocabulary import Action
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,12 +27,14 @@ class Records:
       length: [E] int32, e, actions taken, including Done.
       success: [E] bool, Done while an instance of the target was visible.
       actions: [E, N] int8, actions taken; -1 after the last, N the largest step limit.
+      collided: [E] bool, whether something blocked a MoveAhead.
     """
 
     shortest: np.ndarray
     length: np.ndarray
     success: np.ndarray
     actions: np.ndarray
+    collided: np.ndarray
 
 
 def evaluate(
@@ -122,20 +125,26 @@ def _play(
 ) -> tuple[jax.Array, ...]:
     count = pose.shape[0]
     transition = jax.vmap(dynamics.transition, (0, 0, None))
-    state = jax.vmap(dynamics.start, (0, 0, None))(pose, target, params)
+    own = None
+    if params.noise is not None:  # no step folds this number into the key
+        own = jax.random.split(jax.random.fold_in(key, limit), count)
+    state = jax.vmap(dynamics.start, (0, 0, None, None, 0))(pose, target, params, None, own)
 
     def unfinished(loop: tuple) -> jax.Array:
-        step, _, _, alive, _, _ = loop
+        step, _, _, alive, *_ = loop
         return (step < limit) & jnp.any(alive)
 
     def body(loop: tuple) -> tuple:
-        step, state, memory, alive, success, actions = loop
+        step, state, memory, alive, success, actions, collided = loop
         memory, action = policy.act(weights, memory, jax.random.fold_in(key, step), state, params)
         out = transition(state, action, params)
+        blocked = (action == Action.MOVE_AHEAD) & (out.state.pose == state.pose)
+        collided = collided | (alive & blocked)
         state = dynamics.choose(alive, out.state, state)
         actions = actions.at[:, step].set(jnp.where(alive, action, -1).astype(jnp.int8))
         success = success | (alive & out.success)
-        return step + 1, state, memory, alive & ~out.terminated & ~out.truncated, success, actions
+        alive = alive & ~out.terminated & ~out.truncated
+        return step + 1, state, memory, alive, success, actions, collided
 
     loop = (
         jnp.zeros((), jnp.int32),
@@ -144,6 +153,7 @@ def _play(
         jnp.ones(count, bool),
         jnp.zeros(count, bool),
         jnp.full((count, limit), -1, jnp.int8),
+        jnp.zeros(count, bool),
     )
-    _, state, _, _, success, actions = jax.lax.while_loop(unfinished, body, loop)
-    return state.shortest, state.steps, success, actions
+    _, state, _, _, success, actions, collided = jax.lax.while_loop(unfinished, body, loop)
+    return state.shortest, state.steps, success, actions, collided

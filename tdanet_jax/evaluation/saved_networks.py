@@ -158,18 +158,22 @@ def evaluate(
     Raises:
       ValueError: a network cannot be read, or was trained on other scene tables.
     """
-    groups: dict[TrainConfig, list[SavedNetwork]] = {}
+    groups: dict[Any, list[SavedNetwork]] = {}
     for network in networks:
-        groups.setdefault(_task_config(network), []).append(network)
+        noiseless = dataclasses.replace(network.test, noise=None)
+        groups.setdefault((_task_config(network), noiseless), []).append(network)
     for members in groups.values():
         task = load_task(members[0].located)
         params, lists = selection.select(task, members[0].test)
         policy = policies.network(task.model, task.words, greedy)
         expected = task.model.parameter_shapes(*task.words.shape)
         width = None if members[0].located.word_vectors is None else task.words.shape[1]
-        together = 1 if jax.default_backend() == "cpu" else TOGETHER
+        senses = [network.test.senses for network in members]
+        worlds = selection.with_senses(task, params, senses)
+        alone = jax.default_backend() == "cpu" or len({*senses}) > 1
+        together = 1 if alone else TOGETHER
         for start in range(0, len(members), together):
-            part = members[start : start + together]
+            part, params = members[start : start + together], worlds[start]
             snapshots = [_checked(network, task) for network in part]
             for network, snapshot in zip(part, snapshots, strict=True):
                 of = network.point or network.run

@@ -6,21 +6,25 @@ Parts are for a quick look and for questions of one's own; reports say that they
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 
+from tdanet_jax import sense_noise
 from tdanet_jax.config import EvalConfig
+from tdanet_jax.env.params import with_noise
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.sense_noise import SenseNoise
+from tdanet_jax.sensors.noise import levels_of
 from tdanet_jax.task import Task
 
 
 def select(task: Task, test: EvalConfig) -> tuple[EnvParams, dict[str, Episodes]]:
-    """The environment of an evaluation, and its episodes by group.
+    """The environment of an evaluation, without noise, and its episodes by group.
 
     Raises:
       ValueError: a value is out of range, a name is unknown, or no episode is left.
@@ -31,6 +35,18 @@ def select(task: Task, test: EvalConfig) -> tuple[EnvParams, dict[str, Episodes]
     if test.step_limit is not None:
         params = params.replace(step_limit=jnp.full_like(params.step_limit, test.step_limit))
     return params, lists
+
+
+def with_senses(task: Task, params: EnvParams, senses: Sequence[SenseNoise]) -> list[EnvParams]:
+    """The environment of an evaluation with each of these noises of the senses.
+
+    All have arrays of the same shapes, so that one compiled program plays them.
+    """
+    if not any(noise.any for noise in senses):
+        return [params] * len(senses)
+    model = with_noise(params, task.tables, sense_noise.MIX, np.asarray(task.words)).noise
+    assert model is not None
+    return [params.replace(noise=model.replace(**levels_of(noise))) for noise in senses]
 
 
 def choose(

@@ -51,6 +51,15 @@ def _window_offsets(rotations: int) -> np.ndarray:
     return np.rint(np.stack([x, z], axis=-1)).astype(np.int32)
 
 
+class Deviation(struct.PyTreeNode):
+    """How far the pose that an agent believes in is off the grid, if its motion slips."""
+
+    place: jax.Array  # [2] float32, from the cell to where it believes to stand; x and z in cells
+    angle: jax.Array  # float32, radians clockwise from its heading to that which it believes in
+    error: jax.Array  # float32, radians by which the heading is wrong in this pose alone
+    step: jax.Array  # [2] float32, x and z in cells that it believes the last action moved it by
+
+
 class OdometryState(struct.PyTreeNode):
     """The agent's pose and map in one episode, in a frame whose origin is the start.
 
@@ -65,6 +74,7 @@ class OdometryState(struct.PyTreeNode):
     action: jax.Array  # int32, the last action; 6 before the first
     blocked: jax.Array  # bool, the last action was a MoveAhead that did not move the agent
     cells: jax.Array  # [MAP_SIZE, MAP_SIZE] uint16, the bits of each cell
+    deviation: Deviation | None = None  # None without noise
 
 
 class OdometryReading(struct.PyTreeNode):
@@ -78,7 +88,7 @@ class OdometryReading(struct.PyTreeNode):
 
 
 class Odometry(Sensor):
-    """Dead reckoning: exact, as the world has no slip."""
+    """Dead reckoning: exact, unless motion slips (`tdanet_jax.sensors.noise`)."""
 
     width = 6 + NUM_ACTIONS + WINDOW * WINDOW * (DIRECTIONS + 1)
 
@@ -93,6 +103,9 @@ class Odometry(Sensor):
             action=jnp.full_like(heading, NUM_ACTIONS),
             blocked=jnp.zeros_like(heading, bool),
             cells=cells.at[0, 0].set((1 << self.grid.neighbour(heading)).astype(jnp.uint16)),
+            deviation=None
+            if start.slip is None
+            else Deviation(jnp.zeros(2), jnp.zeros(()), start.slip.error, jnp.zeros(2)),
         )
 
     def update(
@@ -104,30 +117,35 @@ class Odometry(Sensor):
         blocked = moves & motion.blocked
         cell = jnp.where(moves & ~blocked, ahead, state.cell)
         heading, horizon = turn(self.grid, state.heading, state.horizon, motion.action)
-        # One cell changes: the one in the way, or the one where the agent stands.
-        changed = jnp.where(blocked, ahead, cell) & (MAP_SIZE - 1)
-        bit = jnp.where(blocked, BLOCKED, 1 << self.grid.neighbour(heading)).astype(jnp.uint16)
-        at = changed[0], changed[1]
-        return OdometryState(
+        after = OdometryState(
             cell=cell,
             heading=heading,
             horizon=horizon,
             action=motion.action.astype(jnp.int32),
             blocked=blocked,
-            cells=state.cells.at[at].set(state.cells[at] | bit),
+            cells=state.cells,
+            deviation=_deviation(self.grid, state, motion),
         )
+        stands, faces = nearest(self.grid, after)
+        # One cell changes: the one in the way, or the one where the agent stands.
+        in_the_way = ahead if motion.slip is None else stands + jnp.asarray(self.grid.steps)[faces]
+        changed = jnp.where(blocked, in_the_way, stands) & (MAP_SIZE - 1)
+        bit = jnp.where(blocked, BLOCKED, 1 << self.grid.neighbour(faces)).astype(jnp.uint16)
+        at = changed[0], changed[1]
+        return after.replace(cells=state.cells.at[at].set(state.cells[at] | bit))
 
     def read(self, state: OdometryState, others: Mapping[str, Any]) -> OdometryReading:
         """The pose relative to the start, and the map around the agent."""
-        heading = state.heading
-        angle = heading * (2 * jnp.pi / self.grid.rotations)
+        angle = believed_angle(self.grid, state)
         sine, cosine = jnp.sin(angle), jnp.cos(angle)
-        x, z = state.cell / (POSITION_SCALE / self.grid.grid_size)
+        stands, heading = nearest(self.grid, state)
+        place = state.cell if state.deviation is None else state.cell + state.deviation.place
+        x, z = place / (POSITION_SCALE / self.grid.grid_size)
         right, ahead = x * cosine - z * sine, x * sine + z * cosine
         down = tilt(self.grid, state.horizon)
         motion = jnp.stack([right, ahead, sine, cosine, down, state.blocked])
         offsets = _window_offsets(self.grid.rotations)
-        around = (state.cell + jnp.asarray(offsets)[heading]) & (MAP_SIZE - 1)
+        around = (stands + jnp.asarray(offsets)[heading]) & (MAP_SIZE - 1)
         bits = state.cells[around[..., 0], around[..., 1]].astype(jnp.int32)
         stood = bits & (BLOCKED - 1)
         own = self.grid.neighbour(heading)
@@ -172,7 +190,49 @@ def tilt(grid: PoseGrid, horizon: jax.Array) -> jax.Array:
     return jnp.asarray(np.array(grid.horizons) / 30, jnp.float32)[horizon]
 
 
+def _deviation(grid: PoseGrid, state: OdometryState, motion: Motion) -> Deviation | None:
+    """How far the believed pose is off the grid after an action."""
+    before, slip = state.deviation, motion.slip
+    if before is None or slip is None:
+        return None
+    ahead = motion.action == Action.MOVE_AHEAD
+    right = jnp.where(motion.action == Action.ROTATE_RIGHT, 1.0, 0.0)
+    right = jnp.where(motion.action == Action.ROTATE_LEFT, -1.0, right)
+    angle = before.angle + jnp.where(ahead, slip.drift, 0.0)
+    angle = angle + right * (slip.turn - 1) * (2 * jnp.pi / grid.rotations)
+    x, z = jnp.asarray(grid.steps, jnp.float32)[state.heading]
+    sine, cosine = jnp.sin(angle), jnp.cos(angle)
+    believed = slip.distance * jnp.stack([x * cosine + z * sine, z * cosine - x * sine])
+    moved = ahead & ~motion.blocked
+    return Deviation(
+        place=before.place + jnp.where(moved, believed - jnp.stack([x, z]), 0.0),
+        angle=angle,
+        error=slip.error,
+        step=jnp.where(moved, believed, 0.0),
+    )
+
+
+def nearest(grid: PoseGrid, state: OdometryState) -> tuple[jax.Array, jax.Array]:
+    """The cell [2] and the heading, both int32, nearest to the pose that the agent believes in."""
+    if state.deviation is None:
+        return state.cell, state.heading
+    cell = state.cell + jnp.rint(state.deviation.place).astype(jnp.int32)
+    off = state.deviation.angle + state.deviation.error
+    turns = jnp.rint(off / (2 * jnp.pi / grid.rotations)).astype(jnp.int32)
+    return cell, (state.heading + turns) % grid.rotations
+
+
+def believed_angle(grid: PoseGrid, state: OdometryState) -> jax.Array:
+    """Radians clockwise from z in which the agent believes to face."""
+    angle = state.heading * (2 * jnp.pi / grid.rotations)
+    if state.deviation is None:
+        return angle
+    return angle + state.deviation.angle + state.deviation.error
+
+
 def last_step(grid: PoseGrid, state: OdometryState) -> jax.Array:
-    """The cells [2] int32, along x and z, that the last action moved the agent by."""
+    """The cells [2], along x and z, that the agent believes the last action moved it by."""
+    if state.deviation is not None:
+        return state.deviation.step
     moved = (state.action == Action.MOVE_AHEAD) & ~state.blocked
     return jnp.where(moved, jnp.asarray(grid.steps)[state.heading], 0)

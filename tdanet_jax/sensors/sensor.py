@@ -17,11 +17,21 @@ import jax
 from tdanet_jax.poses import ITHOR, PoseGrid
 
 
+class Slip(NamedTuple):
+    """How an agent misjudges its motion; of a perfect one factors are 1 and angles 0."""
+
+    distance: jax.Array  # float32, believed length of a MoveAhead, as a share of the step
+    turn: jax.Array  # float32, believed angle of a turn, as a share of it
+    drift: jax.Array  # float32, radians by which the believed heading turns before a MoveAhead
+    error: jax.Array  # float32, radians by which the heading is wrong in this pose alone
+
+
 class Start(NamedTuple):
     """How the agent faces at the start of an episode."""
 
     rotation: jax.Array  # int32, turns clockwise from the grid's z axis, see PoseGrid
     horizon: jax.Array  # int32, index of the horizon; in iTHOR 1 looks 30 degrees down, 0 level
+    slip: Slip | None = None  # of the first pose; None if all motion is as the agent believes
 
 
 class Motion(NamedTuple):
@@ -29,6 +39,7 @@ class Motion(NamedTuple):
 
     action: jax.Array  # int32; 6 before the first action, which changes nothing
     blocked: jax.Array  # bool, the agent did not move; only meaningful after a MoveAhead
+    slip: Slip | None = None  # as in `Start`: None in all of an episode, or never
 
 
 class Frame(NamedTuple):

@@ -85,11 +85,10 @@ class Triangulation(Sensor):
         object tracked so far, it starts anew with the largest. Only the first ray from one point
         counts.
         """
-        heading, horizon = others["odometry"].heading, others["odometry"].horizon
+        angle = odometry.believed_angle(self.grid, others["odometry"])
         boxes, is_target = frame.boxes, frame.mask & (frame.classes == frame.target)
-        rays = _rays(
-            self.grid, boxes, heading, horizon
-        )  # as long as what they show is one metre deep
+        # As long as what they show is one metre deep.
+        rays = _rays(self.grid, boxes, angle, others["odometry"].horizon)
         lengths = jnp.linalg.norm(rays, axis=-1)
         directions = rays / lengths[:, None]
         cosine = _dot(directions, _direction(_solve(state)[0]))
@@ -122,7 +121,7 @@ class Triangulation(Sensor):
         and these two times the certainty.
         """
         position, weight = _solve(state)
-        angle = others["odometry"].heading * (2 * jnp.pi / self.grid.rotations)
+        angle = odometry.believed_angle(self.grid, others["odometry"])
         sine, cosine = jnp.sin(angle), jnp.cos(angle)
         x, y, z = position
         turned = jnp.stack([x * cosine - z * sine, y, x * sine + z * cosine])
@@ -171,12 +170,14 @@ def _direction(position: jax.Array) -> jax.Array:
     return position / jnp.maximum(jnp.linalg.norm(position), 1e-6)
 
 
-def _rays(grid: PoseGrid, boxes: jax.Array, heading: jax.Array, horizon: jax.Array) -> jax.Array:
-    """Rays to the centres of boxes [K, 3], one metre deep along the optical axis: [K, 3]."""
+def _rays(grid: PoseGrid, boxes: jax.Array, angle: jax.Array, horizon: jax.Array) -> jax.Array:
+    """Rays to the centres of boxes [K, 3], one metre deep along the optical axis: [K, 3].
+
+    The agent faces `angle` radians clockwise from z.
+    """
     right, up = 2 * boxes[:, 0] - 1, 1 - 2 * boxes[:, 1]
     down = odometry.tilt(grid, horizon) * (jnp.pi / 6)
     ahead, up = jnp.cos(down) + up * jnp.sin(down), up * jnp.cos(down) - jnp.sin(down)
-    angle = heading * (2 * jnp.pi / grid.rotations)
     sine, cosine = jnp.sin(angle), jnp.cos(angle)
     return jnp.stack([right * cosine + ahead * sine, up, ahead * cosine - right * sine], axis=-1)
 

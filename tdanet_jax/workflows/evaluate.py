@@ -117,6 +117,7 @@ def _evaluate_policy(
     config = dataclasses.replace(config, **chosen)
     task, seed = load_task(config), config.seed if seed is None else seed
     params, lists = selection.select(task, test)
+    params = selection.with_senses(task, params, [test.senses])[0]
     played = rollout.evaluate_lists(policy, None, params, lists, seed)
     provenance = report.Provenance.of(task, config, name, seed, departures=test.departures)
     return report.results(provenance, task.tables, played, folder)

@@ -31,13 +31,17 @@ SPLITS = [("18/4", False), ("14/8", False), ("18/4", True), ("Bread,Mug,Towel", 
 NAMES = ["18/4", "14/8", "18/4-validation", "own-validation"]
 
 
+#: Every way in which a class could be shown that is not there.
+ALL_NOISE = "misses=0.2,swaps=0.2,confusions=0.3,false_positives=2,duplicates=0.2,jitter=0.1"
+
+
 def config_of(
-    split: str, validation: bool, rows: Any = "class", sensors: bool = False
+    split: str, validation: bool, rows: Any = "class", sensors: bool = False, noise: str = "none"
 ) -> TrainConfig:
     return TrainConfig(
         split=split,
         validation=validation,
-        learner=LearnerConfig(num_envs=16, rollout_steps=8, step_limit=6),
+        learner=LearnerConfig(num_envs=16, rollout_steps=8, step_limit=6, noise=noise),
         network=NetworkConfig(
             width=8, hidden=8, rows=rows, odometry=sensors, triangulation=sensors
         ),
@@ -182,7 +186,9 @@ def training_walk(params: EnvParams) -> tuple[Any, ...]:
 def test_perturbing_all_hidden_data_changes_nothing_that_training_reads(
     rooms: SceneTables, glove: WordVectors, split: tuple[str, bool], rows: str, sensors: bool
 ) -> None:
-    check_perturbed(config_of(*split, rows, sensors), make_split(*split).hidden, rooms, glove)
+    # With sensors their noise, too: labels and false positives from the training rooms alone.
+    config = config_of(*split, rows, sensors, ALL_NOISE if sensors else "none")
+    check_perturbed(config, make_split(*split).hidden, rooms, glove)
 
 
 @pytest.mark.parametrize(
@@ -303,6 +309,20 @@ def test_no_training_episode_shows_or_asks_for_a_hidden_class(
     assert not np.isin(params.target_class[params.pair_target], indices).any()
     assert not np.asarray(task.train_words)[indices].any()
     assert not hidden & {rooms.classes[i] for edge in task.classes.edges for i in edge[:2]}
+
+
+def test_noise_shows_no_hidden_class(rooms: SceneTables, glove: WordVectors) -> None:
+    split = ("18/4", False)
+    task = make_task(config_of(*split, "object", noise=ALL_NOISE), rooms, glove)
+    hidden = [rooms.classes.index(name) for name in make_split(*split).hidden]
+    noise = jax.device_get(task.train_params.noise)
+    known = np.setdiff1d(np.unique(task.train_params.row_class), hidden)
+    np.testing.assert_array_equal(noise.known, known)
+    assert not np.isin(noise.similar[known], hidden).any()
+    obs, *_ = jax.device_get(training_walk(task.train_params))
+    assert not np.isin(obs.classes[obs.mask], hidden).any()
+    spare = obs.classes[..., -4:][obs.mask[..., -4:]]
+    assert len(np.unique(spare)) > 30, "there should have been false positives"
 
 
 @pytest.mark.parametrize("model", ["ssnet", "mjolnir-o"])

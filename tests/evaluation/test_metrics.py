@@ -43,6 +43,21 @@ def test_rates_are_those_of_a_loop_and_spl_is_at_most_sr(episodes: tuple) -> Non
             assert 0 <= low <= high <= 100
 
 
+def test_collision_free_measures_count_what_collided_as_failed() -> None:
+    success = np.array([True, True, False, True])
+    shortest, length = np.array([5, 5, 5, 6]), np.array([10, 5, 5, 6])
+    collided = np.array([False, True, True, False])
+    out = metrics.summarise(success, shortest, length, np.arange(4), collided)["L>=5"]
+    assert [out[name] for name in metrics.MEASURES] == [75, 62.5, 50, 37.5]
+    assert out["CF-SR_ci"][0] <= 50 <= out["CF-SR_ci"][1]
+    columns = dict(
+        zip(metrics.COLUMNS, (success, shortest, length, np.arange(4), collided), strict=True)
+    )
+    other = {**columns, "collided": np.zeros(4, bool)}
+    assert metrics.difference(columns, other)["L>=1"]["CF-SR"] == -25
+    assert metrics.difference(columns, other)["L>=1"]["SR"] == 0
+
+
 def test_spl_of_single_episodes() -> None:
     success = np.array([True, True, True, False, False])
     shortest = np.array([4, 4, 1, 4, 4])

@@ -8,10 +8,11 @@ import pytest
 
 from tdanet_jax.evaluation import report
 from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.evaluation.metrics import MEASURES
 from tdanet_jax.evaluation.rollout import Records
 from tdanet_jax.vocabulary import ALL_TARGETS
 
-BUCKET = {"SR", "SPL", "SR_ci", "SPL_ci", "n"}
+BUCKET = {*MEASURES, *(f"{measure}_ci" for measure in MEASURES), "n"}
 TOP = [
     "version", "split", "model", "policy", "episodes_trained", "seen", "unseen", "by_room",
     "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "sensors",
@@ -33,6 +34,7 @@ def played(ithor):
         length=np.array([4, 4, 4]),
         success=np.array([True, False, False]),
         actions=actions,
+        collided=np.array([False, True, False]),
     )
     return {"seen": (episodes, records)}
 
@@ -113,7 +115,8 @@ def test_percentages_run_from_0_to_100_and_an_empty_bucket_is_null(written):
     _, out = written
     assert out["seen"]["L>=1"]["SR"] == pytest.approx(100 / 3, abs=0.01)
     assert out["seen"]["L>=1"]["SPL"] == pytest.approx(100 / 3, abs=0.01)
-    assert out["seen"]["L>=5"] == {"SR": None, "SPL": None, "SR_ci": None, "SPL_ci": None, "n": 0}
+    assert out["seen"]["L>=5"] == {**dict.fromkeys(BUCKET), "n": 0}
+    assert out["seen"]["L>=1"]["CF-SR"] == out["seen"]["L>=1"]["SR"]  # the one that collided failed
 
 
 def test_one_record_per_episode(written, played, ithor):
@@ -141,7 +144,9 @@ def test_unseen_classes_with_a_near_synonym_are_reported_apart(ithor, tmp_path):
     episodes = Episodes(np.array(poses, np.int32), np.array(goals, np.int32))
     actions = np.full((2, 200), -1, np.int8)
     actions[:, :3] = [0, 0, 5]
-    records = Records(np.array([3, 3]), np.array([3, 3]), np.array([True, False]), actions)
+    records = Records(
+        np.array([3, 3]), np.array([3, 3]), np.array([True, False]), actions, np.zeros(2, bool)
+    )
     provenance = report.Provenance("18/4", "tdanet", "sample", 10, 3, 7, 200, ithor.data_version)
     played = {"seen": (episodes, records), "unseen": (episodes, records)}
     report.results(provenance, ithor, played, tmp_path)

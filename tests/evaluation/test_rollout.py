@@ -287,3 +287,16 @@ def test_a_history_of_any_length_is_traced_once_a_list(
     counted = Policy(policy.start, traced)
     lists = {"seen": drawn(rooms, 1), "unseen": drawn(rooms, 1)}  # of one shape: one compilation
     assert len(rollout.evaluate_stacked(counted, stacked, params, lists, 0)) == 20
+
+
+def test_who_walks_into_something_has_collided(rooms: SceneTables, params: EnvParams) -> None:
+    chosen = drawn(rooms, 5)
+    records = rollout.evaluate(policies.random(), None, params, chosen, KEY)
+    for i, actions in enumerate(records.actions):
+        pose, bumped = jnp.int32(chosen.pose[i]), False
+        for action in actions[: records.length[i]]:
+            after = int(rooms.next_position[int(pose) // 16, int(pose) // 2 % 8])
+            bumped |= bool(action == 0 and after == int(pose) // 16)
+            pose = dynamics.move(pose, jnp.int32(action), params)
+        assert records.collided[i] == bumped
+    assert 0 < records.collided.sum() < len(chosen.pose)

@@ -30,6 +30,7 @@ class Fault(NamedTuple):
 ENV, LEARNER, TDANET = "env/dynamics.py", "training/learner.py", "models/tdanet.py"
 PARAMS, AGENT, SUITE = "env/params.py", "agent/agent.py", "sensors/suite.py"
 ODOMETRY, TRIANGULATION = "sensors/odometry.py", "sensors/triangulation.py"
+NOISE = "sensors/noise.py"
 TEST_TDANET = "models/test_tdanet.py"
 FAULTS = (
     Fault("variants know of test rooms", "scenes/variants.py", "known = statistics(scenes)",
@@ -82,8 +83,22 @@ FAULTS = (
           "first, centre_and_area(", "env/test_dynamics.py"),
     Fault("headings are not turned", ODOMETRY, "(turned | bits & BLOCKED)",
           "(stood | bits & BLOCKED)", "sensors/test_odometry.py"),
-    Fault("what blocks is where one stands", ODOMETRY, "jnp.where(blocked, ahead, cell)", "cell",
-          "sensors/test_odometry.py"),
+    Fault("what blocks is where one stands", ODOMETRY, "jnp.where(blocked, in_the_way, stands)",
+          "stands", "sensors/test_odometry.py"),
+    Fault("missed ones are duplicated", NOISE, "there[copied] & (again", "(again",
+          "sensors/test_noise.py"),
+    Fault("false positives are swapped", NOISE, "levels.swaps) & ~is_false", "levels.swaps)",
+          "sensors/test_noise.py"),
+    Fault("a label is swapped for itself", NOISE, "pick + (params.known[pick] >= classes)", "pick",
+          "sensors/test_noise.py"),
+    Fault("a drift does not turn steps", ODOMETRY, "jnp.where(ahead, slip.drift, 0.0)", "0.0",
+          "sensors/test_noise.py"),
+    Fault("noise moves the agent", ENV, "turns & noise.turn_fails", "noise.turn_fails",
+          "sensors/test_noise.py"),
+    Fault("hidden classes are similar", "task.py", "sense_noise.parse(config.learner.noise),\n            train_words",
+          "sense_noise.parse(config.learner.noise),\n            words", "env/test_zero_shot.py"),
+    Fault("collisions are forgotten", "evaluation/rollout.py", "collided | (alive & blocked)",
+          "alive & blocked", "evaluation/test_rollout.py"),
     Fault("one visit is remembered", ODOMETRY, "state.cells[at] | bit", "bit",
           "sensors/test_odometry.py"),
     Fault("the map ends", ODOMETRY, "[heading]) & (MAP_SIZE - 1)", "[heading])",

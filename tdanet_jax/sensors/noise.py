@@ -1,0 +1,296 @@
+"""Senses that err: detections and motion as an agent perceives them, from those of the world.
+
+A frame is a pure function of the episode's key, the number of the step and the pose: whoever looks
+twice sees the same. Levels are arrays, so that one compiled program serves them all. Random numbers
+are fields of 16 bits of one draw per step, a column for each detection and a last one for the
+motion that led to the step.
+
+Axes: K detections of the tables, R = K + SPARE rows of a noisy frame, A known classes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from tdanet_jax.sense_noise import SenseNoise, ends
+from tdanet_jax.sensors.sensor import Slip
+
+#: Rows at the end of a frame: first for duplicates, then for false positives.
+DUPLICATES, FALSE_POSITIVES = 4, 4
+SPARE = DUPLICATES + FALSE_POSITIVES
+#: Side of a box, as a share of the image's, at which misses of small boxes have fallen to 1/e.
+SMALL_SIDE = 0.1
+#: Classes that a class can be confused with.
+SIMILAR = 4
+#: Classes that look alike, or that detectors often take for each other; the nearest word vectors
+#: give the others.
+LOOKALIKES = (
+    ("Mug", "Cup"), ("Bowl", "Pot"), ("Pan", "Plate"), ("Laptop", "Television"),
+    ("ArmChair", "Sofa"), ("Chair", "Stool"), ("Book", "Box"), ("CoffeeMachine", "Toaster"),
+    ("DeskLamp", "FloorLamp"), ("DiningTable", "Desk"), ("CoffeeTable", "SideTable"),
+    ("Cabinet", "Drawer"), ("Dresser", "Drawer"), ("SoapBottle", "SprayBottle"),
+    ("ToiletPaper", "PaperTowelRoll"), ("Towel", "HandTowel"), ("Painting", "Mirror"),
+    ("CellPhone", "RemoteControl"), ("Fork", "Spoon"), ("Knife", "ButterKnife"),
+    ("Potato", "Egg"), ("Apple", "Tomato"), ("Vase", "WineBottle"), ("Pillow", "TeddyBear"),
+    ("Microwave", "Toaster"), ("GarbageCan", "LaundryHamper"),
+)  # fmt: skip
+
+#: Fields of a detection's column of random bits.
+_MISS, _CHANGE, _CLASS, _X, _Y, _WIDTH, _HEIGHT, _EXTRA = range(8)
+#: Fields of the motion's column.
+_STEP, _TURN, _ERROR, _SHORT, _LENGTH, _FAIL = range(6)
+
+
+class NoiseLevels(NamedTuple):
+    """The fields of `SenseNoise`, each [] float32; biases and drift with the episode's sign."""
+
+    misses: jax.Array
+    small_misses: jax.Array
+    false_positives: jax.Array
+    duplicates: jax.Array
+    swaps: jax.Array
+    confusions: jax.Array
+    jitter: jax.Array
+    truncation: jax.Array
+    distance_bias: jax.Array
+    distance_noise: jax.Array
+    turn_bias: jax.Array
+    turn_noise: jax.Array
+    heading_drift: jax.Array
+    heading_error: jax.Array
+    short_steps: jax.Array
+    failed_turns: jax.Array
+
+
+#: Levels to which an episode gives a sign.
+_SIGNED = np.array(
+    [name in ("distance_bias", "turn_bias", "heading_drift") for name in NoiseLevels._fields]
+)
+
+
+class NoiseParams(struct.PyTreeNode):
+    """What the environment needs for senses that err; part of `EnvParams`."""
+
+    low: jax.Array  # [16] float32, least levels of an episode, in the order of `NoiseLevels`
+    high: jax.Array  # [16] float32, greatest levels
+    corners: jax.Array  # [N + K, 4] float32, x1, y1, x2, y2 of each detection's extent
+    known: jax.Array  # [A] int32, ascending: the classes that are detected anywhere
+    similar: jax.Array  # [C, SIMILAR] int32, what a class is confused with
+    rows: int = struct.field(pytree_node=False)  # N, detections in the tables
+    one_per_class: bool = struct.field(pytree_node=False)  # frames have one row per class
+
+
+class EpisodeNoise(struct.PyTreeNode):
+    """The noise of one episode; part of `EnvState`."""
+
+    key: jax.Array  # [2] uint32, data of the episode's key
+    levels: jax.Array  # [16] float32, in the order of `NoiseLevels`
+
+
+class Detections(NamedTuple):
+    """The rows of a frame."""
+
+    classes: jax.Array  # [R] int32
+    boxes: jax.Array  # [R, 3] float32
+    mask: jax.Array  # [R] bool
+
+
+def make_params(
+    noise: SenseNoise, corners: np.ndarray, classes: np.ndarray, words: np.ndarray,
+    names: tuple[str, ...], padding: int, one_per_class: bool,
+) -> NoiseParams:  # fmt: skip
+    """The parameters for some tables of detections.
+
+    Args:
+      noise: the levels.
+      corners: [N, 4], extent of each detection, as shares of the image.
+      classes: [N], its class.
+      words: [C, D], word vectors. Only classes that occur in `classes` enter anything.
+      names: of the C classes.
+      padding: rows to append, K.
+      one_per_class: whether frames have one row per class instead of one per object.
+    """
+    known = np.unique(classes) if len(classes) else np.zeros(1, int)
+    return NoiseParams(
+        **levels_of(noise),
+        corners=jnp.asarray(np.pad(corners.astype(np.float32), ((0, padding), (0, 0)))),
+        known=jnp.asarray(known, jnp.int32),
+        similar=jnp.asarray(_similar_classes(words, names, known), jnp.int32),
+        rows=len(classes),
+        one_per_class=one_per_class,
+    )
+
+
+def levels_of(noise: SenseNoise) -> dict[str, jax.Array]:
+    """The fields `low` and `high` of `NoiseParams`; replacing them compiles nothing."""
+    ranges = np.array([ends(getattr(noise, name)) for name in NoiseLevels._fields], np.float32)
+    return {"low": jnp.asarray(ranges[:, 0]), "high": jnp.asarray(ranges[:, 1])}
+
+
+def _similar_classes(words: np.ndarray, names: tuple[str, ...], known: np.ndarray) -> np.ndarray:
+    """What each class is confused with: look-alikes, then the classes with the nearest words."""
+    unit = words / np.maximum(np.linalg.norm(words, axis=1, keepdims=True), 1e-9)
+    out = np.repeat(np.arange(len(names))[:, None], SIMILAR, axis=1)
+    index = {names[c]: c for c in known}
+    for cls in known:
+        pairs = (pair for pair in LOOKALIKES if names[cls] in pair)
+        alike = [index[n] for pair in pairs for n in pair if n in index and n != names[cls]]
+        nearest = known[np.argsort(-(unit[known] @ unit[cls]), kind="stable")]
+        ordered = dict.fromkeys([*alike, *(c for c in nearest if c != cls)])
+        if ordered:
+            out[cls] = np.resize([*ordered][:SIMILAR], SIMILAR)
+    return out
+
+
+def begin(key: jax.Array, params: NoiseParams) -> EpisodeNoise:
+    """The noise of an episode: levels from their ranges, and signs of what is the same in all of
+    it."""
+    own, draw = jax.random.split(key)
+    bits = jax.random.bits(draw, (2, len(_SIGNED)), jnp.uint16)
+    level = params.low + (params.high - params.low) * _uniform(bits[0])
+    sign = jnp.where(_SIGNED & (bits[1] >> 15 == 1), -1.0, 1.0)
+    return EpisodeNoise(key=jax.random.key_data(own), levels=sign * level)
+
+
+def draw(noise: EpisodeNoise, step: jax.Array, detections: int) -> jax.Array:
+    """The random bits of a step, [8, detections + SPARE + 1] uint16."""
+    key = jax.random.fold_in(jax.random.wrap_key_data(noise.key), step)
+    return jax.random.bits(key, (8, detections + SPARE + 1), jnp.uint16)
+
+
+def detect(
+    seen: Detections, corners: jax.Array, bits: jax.Array, noise: EpisodeNoise,
+    params: NoiseParams, row_class: jax.Array,
+) -> Detections:  # fmt: skip
+    """What a detector makes of the K detections in view: R rows, the padding zero.
+
+    Args:
+      seen: the detections in view, [K].
+      corners: [K, 4], their extents.
+      bits: of the step (`draw`).
+      noise: of the episode.
+      params: tables of classes and boxes.
+      row_class: [N + K] int32, classes of all detections, for false positives.
+    """
+    levels = NoiseLevels(*noise.levels)
+    count = seen.mask.shape[0]
+    # Duplicates copy rows that are there; false positives those of any view. The rest stays.
+    number = jnp.sum(seen.mask, dtype=jnp.int32)
+    spare = bits[_EXTRA, count : count + SPARE]
+    copied = jnp.minimum(_index(spare[:DUPLICATES], number), count - 1)
+    strange = _wide_index(spare[DUPLICATES:], bits[_CLASS, count + DUPLICATES : -1], params.rows)
+    box_of_strange = params.corners[strange]
+    x1, y1, x2, y2 = box_of_strange.T
+    strange_box = jnp.stack([(x1 + x2) / 2, (y1 + y2) / 2, (x2 - x1) * (y2 - y1)], axis=-1)
+    classes = jnp.concatenate([seen.classes, seen.classes[copied], row_class[strange]])
+    boxes = jnp.concatenate([seen.boxes, seen.boxes[copied], strange_box])
+    corners = jnp.concatenate([corners, corners[copied], box_of_strange])
+    bits = bits[:, :-1]
+    chance = _uniform(bits[_MISS])
+    side = jnp.sqrt(boxes[:count, 2])
+    shown = (1 - levels.misses) * (1 - levels.small_misses * jnp.exp(-side / SMALL_SIDE))
+    there = seen.mask & (chance[:count] >= 1 - shown)
+    again, false = chance[count : count + DUPLICATES], chance[count + DUPLICATES :]
+    mask = jnp.concatenate(
+        [
+            there,
+            there[copied] & (again < levels.duplicates * number / DUPLICATES),
+            false < levels.false_positives / FALSE_POSITIVES,
+        ]
+    )
+    is_false = jnp.arange(len(mask)) >= count + DUPLICATES
+    classes = _labels(classes, bits, levels, params, is_false)
+    boxes, visible = _boxes(boxes, corners, bits, levels)
+    mask &= visible
+    if params.one_per_class:
+        earlier = jnp.tril(jnp.ones((len(mask), len(mask)), bool), -1)
+        mask &= ~jnp.any(earlier & mask & (classes == classes[:, None]), axis=1)
+    return Detections(jnp.where(mask, classes, 0), jnp.where(mask[:, None], boxes, 0.0), mask)
+
+
+def _labels(
+    classes: jax.Array, bits: jax.Array, levels: NoiseLevels, params: NoiseParams,
+    is_false: jax.Array,
+) -> jax.Array:  # fmt: skip
+    """Labels: swapped for any other known class, else confused with a similar one."""
+    chance = _uniform(bits[_CHANGE])
+    swap = (chance < levels.swaps) & ~is_false
+    confuse = ~swap & (chance < levels.swaps + (1 - levels.swaps) * levels.confusions) & ~is_false
+    others = max(params.known.shape[0] - 1, 1)
+    pick = _index(bits[_CLASS], jnp.int32(others))
+    # The known classes are ascending: skipping the own one leaves `others` of them.
+    at = pick + (params.known[pick] >= classes)
+    other = params.known[jnp.minimum(at, params.known.shape[0] - 1)]
+    alike = params.similar[classes, (bits[_CLASS] >> 14).astype(jnp.int32)]
+    return jnp.where(swap, other, jnp.where(confuse, alike, classes))
+
+
+def _boxes(
+    boxes: jax.Array, corners: jax.Array, bits: jax.Array, levels: NoiseLevels
+) -> tuple[jax.Array, jax.Array]:
+    """Boxes x, y, S after jitter and truncation, and whether anything of them is left.
+
+    Without either, every value stays the same to the last bit.
+    """
+    lower, upper = corners[:, :2], corners[:, 2:]
+    side = upper - lower
+    moved = levels.jitter * _normal(bits[_X : _Y + 1].T) * side
+    grown = (jnp.exp(levels.jitter * _normal(bits[_WIDTH : _HEIGHT + 1].T)) - 1) * side / 2
+    least, most = levels.truncation, 1 - levels.truncation
+    low = jnp.clip(lower + (moved - grown), least, most)
+    high = jnp.clip(upper + (moved + grown), least, most)
+    middle = boxes[:, :2] + ((low - lower) + (high - upper)) / 2
+    whole = jnp.prod(side, axis=1)
+    ratio = jnp.where(whole > 0, jnp.prod(high - low, axis=1) / jnp.maximum(whole, 1e-12), 1.0)
+    area = jnp.minimum(boxes[:, 2] * ratio, 1.0)
+    left = jnp.all((high > low) | (side <= 0), axis=1)
+    return jnp.concatenate([middle, area[:, None]], axis=1), left
+
+
+def slip(bits: jax.Array, noise: EpisodeNoise) -> Slip:
+    """How the motion that leads to a step is misjudged, from the step's bits."""
+    levels, own = NoiseLevels(*noise.levels), bits[:, -1]
+    short = _uniform(own[_SHORT]) < levels.short_steps
+    factor = 1 + levels.distance_bias + levels.distance_noise * _normal(own[_STEP])
+    return Slip(
+        distance=factor * jnp.where(short, 1 + _uniform(own[_LENGTH]), 1.0),
+        turn=1 + levels.turn_bias + levels.turn_noise * _normal(own[_TURN]),
+        drift=jnp.radians(levels.heading_drift),
+        error=jnp.radians(levels.heading_error) * _normal(own[_ERROR]),
+    )
+
+
+def turn_fails(bits: jax.Array, noise: EpisodeNoise) -> jax.Array:
+    """Whether a turn that leads to a step fails, from the step's bits."""
+    return _uniform(bits[_FAIL, -1]) < NoiseLevels(*noise.levels).failed_turns
+
+
+def _uniform(bits: jax.Array) -> jax.Array:
+    """From 16 bits, a multiple of 2^-16 in [0, 1)."""
+    return bits.astype(jnp.float32) * jnp.float32(2.0**-16)
+
+
+def _index(bits: jax.Array, count: jax.Array) -> jax.Array:
+    """From 16 bits, a whole number from 0 below `count`, which is at most 2^15."""
+    return (bits.astype(jnp.int32) * count) >> 16
+
+
+def _wide_index(high: jax.Array, low: jax.Array, count: int) -> jax.Array:
+    """From 32 bits, a whole number from 0 below `count`, all but equally likely."""
+    share = high.astype(jnp.float32) * 2.0**-16 + low.astype(jnp.float32) * 2.0**-32
+    return jnp.clip((share * count).astype(jnp.int32), 0, max(count - 1, 0))
+
+
+def _normal(bits: jax.Array) -> jax.Array:
+    """From 16 bits, a number with mean 0 and deviation 1: the sum of four uniform ones of 4 bits.
+
+    Close to normal, in steps of 0.11, and never beyond 3.3.
+    """
+    whole = bits.astype(jnp.int32)
+    total = (whole & 15) + (whole >> 4 & 15) + (whole >> 8 & 15) + (whole >> 12)
+    return (total - 30).astype(jnp.float32) * jnp.float32(85.0**-0.5)

@@ -1,0 +1,134 @@
+"""Senses that err, one detection and one action at a time: plain Python, from the definitions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+Bits = Sequence[Sequence[int]]  # eight fields of 16 bits for each column
+
+
+class Detected(NamedTuple):
+    """A row of a frame."""
+
+    cls: int
+    x: float
+    y: float
+    area: float
+
+
+class Seen(NamedTuple):
+    """A detection without noise, with its extent x1, y1, x2, y2."""
+
+    cls: int
+    box: tuple[float, float, float]
+    extent: tuple[float, float, float, float]
+
+
+def share(bits: int) -> float:
+    """A number in [0, 1) from 16 bits."""
+    return bits / 65536
+
+
+def normal(bits: int) -> float:
+    """A number of mean 0 and deviation 1 from four draws of 0 to 15."""
+    digits = [bits >> shift & 15 for shift in (0, 4, 8, 12)]
+    return (sum(digits) - 30) / math.sqrt(85)
+
+
+def detect(
+    seen: Sequence[Seen], longest: int, everything: Sequence[Seen], bits: Bits,
+    level: Mapping[str, float], known: Sequence[int], similar: Sequence[Sequence[int]],
+) -> list[Detected | None]:  # fmt: skip
+    """The rows of a frame: `longest` for what is there, four for duplicates, four for false ones.
+
+    Args:
+      seen: what is in view.
+      longest: rows for it.
+      everything: all detections of all views.
+      bits: [8][longest + 9].
+      level: levels of noise by name.
+      known: classes that are detected anywhere, ascending.
+      similar: what each class is confused with.
+    """
+    miss, change, pick, dx, dy, dw, dh, extra = bits
+    rows: list[Detected | None] = [None] * (longest + 8)
+    shown = []
+    for i, one in enumerate(seen):
+        tiny = level["small_misses"] * math.exp(-math.sqrt(one.box[2]) / 0.1)
+        shown.append(share(miss[i]) >= 1 - (1 - level["misses"]) * (1 - tiny))
+
+    def perceived(one: Seen, i: int, known_label: bool) -> Detected | None:
+        cls = one.cls
+        swaps, chance = level["swaps"], share(change[i])
+        if not known_label and chance < swaps:
+            others = [c for c in known if c != one.cls]
+            if others:
+                cls = others[pick[i] * len(others) // 65536]
+        elif not known_label and chance < swaps + (1 - swaps) * level["confusions"]:
+            cls = similar[one.cls][pick[i] // 16384]
+        x1, y1, x2, y2 = one.extent
+        edges = []
+        for low, high, move, grow in ((x1, x2, dx[i], dw[i]), (y1, y2, dy[i], dh[i])):
+            middle = (low + high) / 2 + level["jitter"] * normal(move) * (high - low)
+            half = (high - low) / 2 * math.exp(level["jitter"] * normal(grow))
+            border = level["truncation"]
+            ends = [min(max(end, border), 1 - border) for end in (middle - half, middle + half)]
+            if ends[0] >= ends[1]:
+                return None
+            edges.append((low, high, *ends))
+        shift = [(a + b - low - high) / 2 for low, high, a, b in edges]
+        ratio = math.prod((b - a) / (high - low) for low, high, a, b in edges)
+        return Detected(
+            cls, one.box[0] + shift[0], one.box[1] + shift[1], min(one.box[2] * ratio, 1.0)
+        )
+
+    for i, one in enumerate(seen):
+        if shown[i]:
+            rows[i] = perceived(one, i, known_label=False)
+    for k in range(4):
+        i = longest + k
+        if seen and share(miss[i]) < level["duplicates"] * len(seen) / 4:
+            copied = extra[i] * len(seen) // 65536
+            if shown[copied]:
+                rows[i] = perceived(seen[copied], i, known_label=False)
+    for k in range(4):
+        i = longest + 4 + k
+        if share(miss[i]) < level["false_positives"] / 4:
+            at = int((extra[i] * 65536 + pick[i]) * len(everything) / 2**32)
+            one = everything[at]
+            x1, y1, x2, y2 = one.extent
+            box = ((x1 + x2) / 2, (y1 + y2) / 2, (x2 - x1) * (y2 - y1))
+            rows[i] = perceived(Seen(one.cls, box, one.extent), i, known_label=True)
+    return rows
+
+
+class Walker:
+    """Where an agent believes to stand, in cells and degrees, from what its wheels tell it."""
+
+    def __init__(self, heading: float) -> None:
+        self.x = self.z = 0.0
+        self.heading = self.nominal = heading
+        self.error = 0.0
+
+    def act(
+        self, action: int, blocked: bool, bits: Sequence[int], level: Mapping[str, Any]
+    ) -> None:
+        """An action; `bits` are the eight fields of the step's last column."""
+        step, turn, error, short, length, *_ = bits
+        factor = 1 + level["distance_bias"] + level["distance_noise"] * normal(step)
+        if share(short) < level["short_steps"]:
+            factor *= 1 + share(length)
+        if action == 0:
+            self.heading += level["heading_drift"]
+            if not blocked:
+                far = math.sqrt(2) if self.nominal % 90 else 1.0
+                self.x += factor * far * math.sin(math.radians(self.heading))
+                self.z += factor * far * math.cos(math.radians(self.heading))
+        if action in (1, 2):
+            sign = -1 if action == 1 else 1
+            angle = 1 + level["turn_bias"] + level["turn_noise"] * normal(turn)
+            self.heading += sign * 45 * angle
+            self.nominal += sign * 45
+        self.error = level["heading_error"] * normal(error)
