@@ -118,7 +118,8 @@ def make(
     config = dataclasses.replace(config or TrainConfig(), split=name.removeprefix(ITHOR))
     config.check()
     task = load_task(config)
-    params = task.train_params if split == "train" else task.eval_params
+    rows = task.eval_params.max_detections  # as many in training: networks of others go to tests
+    params = task.train_params.with_rows(rows) if split == "train" else task.eval_params
     words = task.train_words if split == "train" else task.words
     return Environment(name, params, task.tables.classes, words), params
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 from tdanet_jax.observation_spec import ObservationSpec
@@ -54,6 +55,15 @@ class EnvParams(struct.PyTreeNode):
     def grid(self) -> PoseGrid:
         """The poses at a position."""
         return self.spec.grid
+
+    def with_rows(self, rows: int) -> EnvParams:
+        """The same with `rows` rows of detections, at least as many as now; the rest is padding."""
+        more = rows - self.max_detections
+        return self.replace(
+            row_class=jnp.pad(self.row_class, (0, more)),
+            row_box=jnp.pad(self.row_box, ((0, more), (0, 0))),
+            max_detections=rows,
+        )
 
 
 class EnvState(struct.PyTreeNode):
