@@ -256,8 +256,9 @@ def step(
 
     Returns:
       observation, state, reward, terminated, truncated, info. `info` holds `success`, the episode's
-      `length` (e, Done included) and `shortest` (L), and `final_state`, the state before the reset:
-      a truncated episode is bootstrapped from `observe(info["final_state"], params)`.
+      `length` (e, Done included) and `shortest` (L), and, as in gymnax, `terminated`, `truncated`
+      and `final_observation`, from which a truncated episode is bootstrapped. It is that of
+      `final_state`, the state before the reset.
     """
     out = transition(state, action, params)
     done = out.terminated | out.truncated
@@ -267,7 +268,10 @@ def step(
         "success": out.success,
         "length": out.state.steps,
         "shortest": state.shortest,
+        "terminated": out.terminated,
+        "truncated": out.truncated,
         "final_state": out.state,
+        "final_observation": observe(out.state, params),
     }
     observation = observe(following, params)
     return observation, following, out.reward, out.terminated, out.truncated, info

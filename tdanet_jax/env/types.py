@@ -10,11 +10,12 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.poses import PoseGrid
-from tdanet_jax.sensors.noise import EpisodeNoise, NoiseParams
+from tdanet_jax.sensors.noise import SPARE, EpisodeNoise, NoiseParams
 
 #: Rows and columns of the class raster, the size of a ResNet-18 feature map.
 RASTER = (7, 7)
@@ -56,6 +57,24 @@ class EnvParams(struct.PyTreeNode):
     def grid(self) -> PoseGrid:
         """The poses at a position."""
         return self.spec.grid
+
+    @property
+    def rows(self) -> int:
+        """Rows of detections in an observation."""
+        return self.max_detections + (0 if self.noise is None else SPARE)
+
+    def with_rows(self, rows: int) -> EnvParams:
+        """The same with so many rows in an observation, at least as many as now."""
+        more = rows - self.rows  # rows of padding, also after the last pose
+        noise = self.noise
+        if noise is not None:
+            noise = noise.replace(corners=jnp.pad(noise.corners, ((0, more), (0, 0))))
+        return self.replace(
+            row_class=jnp.pad(self.row_class, (0, more)),
+            row_box=jnp.pad(self.row_box, ((0, more), (0, 0))),
+            noise=noise,
+            max_detections=self.max_detections + more,
+        )
 
 
 class EnvState(struct.PyTreeNode):

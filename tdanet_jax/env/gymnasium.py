@@ -1,0 +1,240 @@
+"""The environment for Gymnasium (https://gymnasium.farama.org): one episode, or many side by side.
+
+Importing this module registers `tdanet/iTHOR-22-0-v1`, `tdanet/iTHOR-18-4-v1` and
+`tdanet/iTHOR-14-8-v1`, so `gymnasium.make("tdanet_jax.env.gymnasium:tdanet/iTHOR-18-4-v1")` needs
+no other import; `gymnasium.make_vec` of the same name gives the vectorised one.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, Literal
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from tdanet_jax.config import TrainConfig
+from tdanet_jax.env import dynamics
+from tdanet_jax.env.environment import FlatObservations
+from tdanet_jax.env.spaces import Box, Dict, Discrete
+from tdanet_jax.env.types import EnvParams, EnvState, Observation
+from tdanet_jax.splits import UNSEEN, file_name
+from tdanet_jax.task import make
+from tdanet_jax.vocabulary import NUM_ACTIONS
+
+#: Version of the registered environments: it changes when their episodes do.
+VERSION = 1
+
+
+def to_gymnasium(space: Discrete | Box | Dict) -> spaces.Space:
+    """The same space as Gymnasium writes it."""
+    if isinstance(space, Discrete):
+        return spaces.Discrete(space.n)
+    if isinstance(space, Dict):
+        return spaces.Dict({name: to_gymnasium(one) for name, one in space.spaces.items()})
+    if space.dtype is bool:
+        return spaces.MultiBinary(space.shape)
+    return spaces.Box(space.low, space.high, space.shape, np.dtype(space.dtype).type)
+
+
+class _Shown:
+    """Makes an environment, and turns its observations into what Gymnasium's users are shown."""
+
+    def __init__(self, name: str, split: Literal["train", "test"], flat: bool, config: Any) -> None:
+        self.env, self.params = make(name, split, config)
+        self.flat = FlatObservations(self.env) if flat else None
+        self.space = to_gymnasium((self.flat or self.env).observation_space(self.params))
+
+    def __call__(self, obs: Observation, params: EnvParams) -> Any:
+        """Of one episode, in JAX."""
+        if self.flat is not None:
+            return self.flat.flatten(obs, params)
+        return {
+            "classes": obs.classes,
+            "boxes": jnp.minimum(obs.boxes, 1.0),
+            "mask": obs.mask.astype(jnp.int8),
+            "target": obs.target,
+        }
+
+
+class NavigationEnv(gymnasium.Env):
+    """One episode at a time.
+
+    Args:
+      name: of an environment, as `tdanet_jax.make` takes it: "ithor-18/4".
+      split: "train" or "test" rooms.
+      flat: observations are vectors with word vectors filled in (`FlatObservations`), or else
+        dictionaries: class indices, boxes, mask and target.
+      config: what else can be set, as `tdanet_jax.make` takes it.
+
+    Raises:
+      ValueError: no environment has this name; by `step`: no action has this number.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own form)
+
+    def __init__(
+        self,
+        name: str = "ithor-18/4",
+        split: Literal["train", "test"] = "train",
+        flat: bool = True,
+        config: TrainConfig | None = None,
+    ) -> None:
+        self._shown = shown = _Shown(name, split, flat, config)
+        self.observation_space = shown.space
+        self.action_space = spaces.Discrete(NUM_ACTIONS)
+        self._state: EnvState | None = None
+
+        @jax.jit
+        def reset(key: jax.Array, params: EnvParams) -> tuple[Any, EnvState]:
+            obs, state = dynamics.reset(key, params)
+            return shown(obs, params), state
+
+        @jax.jit
+        def step(state: EnvState, action: jax.Array, params: EnvParams) -> tuple[Any, Any]:
+            out = dynamics.transition(state, action, params)
+            return shown(dynamics.observe(out.state, params), params), out
+
+        self._reset, self._step = reset, step
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the classes that observations without word vectors hold by index."""
+        return self._shown.env.class_names
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Starts a random episode: (observation, info with the target's name)."""
+        super().reset(seed=seed, options=options)
+        key = jax.random.key(int(self.np_random.integers(2**31)))
+        obs, self._state = self._reset(key, self._shown.params)
+        return self._on_host(obs), self._about(self._state)
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One action; `info` holds the target's name, `success`, `length` and `shortest`."""
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        _check(action)
+        obs, out = self._step(self._state, jnp.int32(action), self._shown.params)
+        out = jax.device_get(out)
+        self._state = out.state
+        info = self._about(out.state) | {"success": bool(out.success)}
+        return (
+            self._on_host(obs),
+            float(out.reward),
+            bool(out.terminated),
+            bool(out.truncated),
+            info,
+        )
+
+    def _on_host(self, obs: Any) -> Any:
+        if isinstance(obs, dict):  # Gymnasium wants a number, not an array
+            return jax.device_get(obs) | {"target": int(obs["target"])}
+        return np.asarray(obs)
+
+    def _about(self, state: EnvState) -> dict[str, Any]:
+        params = self._shown.params
+        target = self.class_names[int(params.target_class[int(state.target)])]
+        return {
+            "target": target,
+            "length": int(state.steps),
+            "shortest": int(state.shortest),
+        }
+
+
+class NavigationVectorEnv(VectorEnv):
+    """Many episodes side by side, in one compiled call; arguments as of `NavigationEnv`.
+
+    An episode that ends is followed by the first observation of another in the same step.
+    `info["final_obs"]` and `info["final_info"]` hold the last ones, where `info["_final_obs"]`.
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        name: str = "ithor-18/4",
+        split: Literal["train", "test"] = "train",
+        flat: bool = True,
+        config: TrainConfig | None = None,
+    ) -> None:
+        shown = self._shown = _Shown(name, split, flat, config)
+        self.num_envs = num_envs
+        self.single_observation_space = shown.space
+        self.single_action_space = spaces.Discrete(NUM_ACTIONS)
+        self.observation_space = batch_space(shown.space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._state: EnvState | None = None
+
+        @functools.partial(jax.vmap, in_axes=(0, None))
+        def reset(key: jax.Array, params: EnvParams) -> tuple[Any, EnvState]:
+            obs, state = dynamics.reset(key, params)
+            return shown(obs, params), state
+
+        @functools.partial(jax.vmap, in_axes=(0, 0, 0, None))
+        def step(key: jax.Array, state: EnvState, action: jax.Array, params: EnvParams) -> Any:
+            obs, state, *outcome, info = dynamics.step(key, state, action, params)
+            final = shown(info["final_observation"], params)
+            about = {name: info[name] for name in ("success", "length", "shortest")}
+            return state, shown(obs, params), outcome, final, about
+
+        self._reset, self._step = jax.jit(reset), jax.jit(step)
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the classes that observations without word vectors hold by index."""
+        return self._shown.env.class_names
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Starts `num_envs` random episodes: (observations, info)."""
+        super().reset(seed=seed, options=options)
+        obs, self._state = self._reset(self._keys(), self._shown.params)
+        return jax.device_get(obs), {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One action [num_envs] in each episode."""
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        for action in np.asarray(actions).tolist():
+            _check(action)
+        taken = jnp.asarray(actions, jnp.int32)
+        self._state, *rest = self._step(self._keys(), self._state, taken, self._shown.params)
+        obs, (reward, terminated, truncated), final, about = jax.device_get(rest)
+        done = terminated | truncated
+        info = {
+            **about,
+            "final_obs": final,
+            "_final_obs": done,
+            "final_info": about,
+            "_final_info": done,
+        }
+        return obs, reward, terminated, truncated, info
+
+    def _keys(self) -> jax.Array:
+        key = jax.random.key(int(self.np_random.integers(2**31)))
+        return jax.random.split(key, self.num_envs)
+
+
+def _check(action: int) -> None:
+    if not 0 <= action < NUM_ACTIONS:
+        raise ValueError(f"action {action}: must be from 0 to {NUM_ACTIONS - 1}")
+
+
+for _split in UNSEEN:
+    gymnasium.register(
+        f"tdanet/iTHOR-{file_name(_split)}-v{VERSION}",
+        entry_point=f"{__name__}:NavigationEnv",
+        vector_entry_point=f"{__name__}:NavigationVectorEnv",
+        kwargs={"name": f"ithor-{_split}"},
+    )
