@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -70,16 +70,10 @@ def test_on_the_host_and_in_jax_the_same_policy_plays_the_same(
     assert len(turned["begun"]) == 2  # seen and unseen
 
 
-@pytest.fixture(scope="module")
-def example() -> ModuleType:
-    spec = importlib.util.spec_from_file_location(
-        "recurrent_ppo", ROOT / "examples" / "recurrent_ppo.py"
-    )
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture
+def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    return importlib.import_module("recurrent_ppo")
 
 
 @pytest.mark.usefixtures("few_episodes")
