@@ -22,7 +22,7 @@ from tdanet_jax.config import TrainConfig
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.environment import FlatObservations
 from tdanet_jax.env.spaces import Box, Dict, Discrete
-from tdanet_jax.env.types import EnvParams, EnvState, Observation
+from tdanet_jax.env.types import EnvParams, EnvState, Observation, Outcome
 from tdanet_jax.splits import UNSEEN, file_name
 from tdanet_jax.task import make
 from tdanet_jax.vocabulary import NUM_ACTIONS
@@ -43,15 +43,39 @@ def to_gymnasium(space: Discrete | Box | Dict) -> spaces.Space:
 
 
 class _Shown:
-    """Makes an environment, and turns its observations into what Gymnasium's users are shown."""
+    """An environment as Gymnasium's users are shown it, and its compiled functions.
 
-    def __init__(self, name: str, split: Literal["train", "test"], flat: bool, config: Any) -> None:
+    Environments with the same arguments share one: tables are large, and compiling takes seconds.
+    """
+
+    def __init__(
+        self, name: str, split: Literal["train", "test"], flat: bool, config: TrainConfig | None
+    ) -> None:
         self.env, self.params = make(name, split, config)
         self.flat = FlatObservations(self.env) if flat else None
         self.space = to_gymnasium((self.flat or self.env).observation_space(self.params))
+        self.reset, self.step = jax.jit(self._reset), jax.jit(self._step)
+        self.reset_many = jax.jit(jax.vmap(self._reset, (0, None)))
+        self.step_many = jax.jit(jax.vmap(self._step_on, (0, 0, 0, None)))
 
-    def __call__(self, obs: Observation, params: EnvParams) -> Any:
-        """Of one episode, in JAX."""
+    def _reset(self, key: jax.Array, params: EnvParams) -> tuple[Any, EnvState]:
+        obs, state = dynamics.reset(key, params)
+        return self._observed(obs, params), state
+
+    def _step(self, state: EnvState, action: jax.Array, params: EnvParams) -> tuple[Any, Outcome]:
+        out = dynamics.transition(state, action, params)
+        return self._observed(dynamics.observe(out.state, params), params), out
+
+    def _step_on(
+        self, key: jax.Array, state: EnvState, action: jax.Array, params: EnvParams
+    ) -> tuple[EnvState, Any]:
+        """With an automatic reset: the state, and all that the host is told."""
+        obs, state, *outcome, info = dynamics.step(key, state, action, params)
+        final = self._observed(info["final_observation"], params)
+        about = {name: info[name] for name in ("success", "length", "shortest")}
+        return state, (self._observed(obs, params), outcome, final, about)
+
+    def _observed(self, obs: Observation, params: EnvParams) -> Any:
         if self.flat is not None:
             return self.flat.flatten(obs, params)
         return {
@@ -60,6 +84,9 @@ class _Shown:
             "mask": obs.mask.astype(jnp.int8),
             "target": obs.target,
         }
+
+
+_shared = functools.lru_cache(maxsize=4)(_Shown)
 
 
 class NavigationEnv(gymnasium.Env):
@@ -85,22 +112,10 @@ class NavigationEnv(gymnasium.Env):
         flat: bool = True,
         config: TrainConfig | None = None,
     ) -> None:
-        self._shown = shown = _Shown(name, split, flat, config)
-        self.observation_space = shown.space
+        self._shown = _shared(name, split, flat, config)
+        self.observation_space = self._shown.space
         self.action_space = spaces.Discrete(NUM_ACTIONS)
         self._state: EnvState | None = None
-
-        @jax.jit
-        def reset(key: jax.Array, params: EnvParams) -> tuple[Any, EnvState]:
-            obs, state = dynamics.reset(key, params)
-            return shown(obs, params), state
-
-        @jax.jit
-        def step(state: EnvState, action: jax.Array, params: EnvParams) -> tuple[Any, Any]:
-            out = dynamics.transition(state, action, params)
-            return shown(dynamics.observe(out.state, params), params), out
-
-        self._reset, self._step = reset, step
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -113,7 +128,7 @@ class NavigationEnv(gymnasium.Env):
         """Starts a random episode: (observation, info with the target's name)."""
         super().reset(seed=seed, options=options)
         key = jax.random.key(int(self.np_random.integers(2**31)))
-        obs, self._state = self._reset(key, self._shown.params)
+        obs, self._state = self._shown.reset(key, self._shown.params)
         return self._on_host(obs), self._about(self._state)
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -121,7 +136,7 @@ class NavigationEnv(gymnasium.Env):
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         _check(action)
-        obs, out = self._step(self._state, jnp.int32(action), self._shown.params)
+        obs, out = self._shown.step(self._state, jnp.int32(action), self._shown.params)
         out = jax.device_get(out)
         self._state = out.state
         info = self._about(out.state) | {"success": bool(out.success)}
@@ -165,27 +180,13 @@ class NavigationVectorEnv(VectorEnv):
         flat: bool = True,
         config: TrainConfig | None = None,
     ) -> None:
-        shown = self._shown = _Shown(name, split, flat, config)
+        shown = self._shown = _shared(name, split, flat, config)
         self.num_envs = num_envs
         self.single_observation_space = shown.space
         self.single_action_space = spaces.Discrete(NUM_ACTIONS)
         self.observation_space = batch_space(shown.space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._state: EnvState | None = None
-
-        @functools.partial(jax.vmap, in_axes=(0, None))
-        def reset(key: jax.Array, params: EnvParams) -> tuple[Any, EnvState]:
-            obs, state = dynamics.reset(key, params)
-            return shown(obs, params), state
-
-        @functools.partial(jax.vmap, in_axes=(0, 0, 0, None))
-        def step(key: jax.Array, state: EnvState, action: jax.Array, params: EnvParams) -> Any:
-            obs, state, *outcome, info = dynamics.step(key, state, action, params)
-            final = shown(info["final_observation"], params)
-            about = {name: info[name] for name in ("success", "length", "shortest")}
-            return state, shown(obs, params), outcome, final, about
-
-        self._reset, self._step = jax.jit(reset), jax.jit(step)
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -197,7 +198,7 @@ class NavigationVectorEnv(VectorEnv):
     ) -> tuple[Any, dict[str, Any]]:
         """Starts `num_envs` random episodes: (observations, info)."""
         super().reset(seed=seed, options=options)
-        obs, self._state = self._reset(self._keys(), self._shown.params)
+        obs, self._state = self._shown.reset_many(self._keys(), self._shown.params)
         return jax.device_get(obs), {}
 
     def step(
@@ -209,8 +210,9 @@ class NavigationVectorEnv(VectorEnv):
         for action in np.asarray(actions).tolist():
             _check(action)
         taken = jnp.asarray(actions, jnp.int32)
-        self._state, *rest = self._step(self._keys(), self._state, taken, self._shown.params)
-        obs, (reward, terminated, truncated), final, about = jax.device_get(rest)
+        step = self._shown.step_many
+        self._state, told = step(self._keys(), self._state, taken, self._shown.params)
+        obs, (reward, terminated, truncated), final, about = jax.device_get(told)
         done = terminated | truncated
         info = {
             **about,

@@ -90,3 +90,33 @@ def test_the_example_trains_and_is_scored(
     results = tdanet_jax.evaluate(policy=example.policy(small, flat, weights), config=config)
     assert results["model"] == "custom"
     assert results["unseen"]["L>=1"]["n"] > 10
+
+
+@pytest.mark.usefixtures("few_episodes")
+@pytest.mark.parametrize("name", ["PPO", "RecurrentPPO"])
+def test_stable_baselines_trains_and_is_scored(
+    name: str, config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By hand, where it is installed: it needs PyTorch."""
+    stable_baselines3 = pytest.importorskip("stable_baselines3")
+    contrib = pytest.importorskip("sb3_contrib")
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    example = importlib.import_module("stable_baselines")
+    algorithm = {"PPO": stable_baselines3.PPO, "RecurrentPPO": contrib.RecurrentPPO}[name]
+    policy = "MlpPolicy" if name == "PPO" else "MlpLstmPolicy"
+    many = example.make_vec_env(example.NavigationEnv, n_envs=2, env_kwargs={"config": config})
+    model = algorithm(policy, many, n_steps=8, batch_size=16, n_epochs=1)
+    model.learn(32)
+    results = example.score(model, config)
+    assert results["unseen"]["L>=1"]["n"] > 10
+
+
+def test_the_wrappers_of_gymnax_fit(flat: FlatObservations) -> None:
+    """By hand, where gymnax is installed."""
+    gymnax = pytest.importorskip("gymnax")
+    env, params = gymnax.wrappers.LogWrapper(flat), flat.default_params
+    obs, state = env.reset(jax.random.key(0), params)
+    assert obs.shape == env.observation_space(params).shape
+    *_, info = env.step(jax.random.key(1), state, jnp.int32(Action.DONE), params)
+    assert info["returned_episode"]
+    assert info["returned_episode_lengths"] == 1
