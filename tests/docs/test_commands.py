@@ -71,8 +71,9 @@ def test_a_command_is_accepted(
     words: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     program, *rest = words
-    if program in ("python", "python3"):
-        assert rest[0] == "-m"
+    if program in ("python", "python3") and rest[0] != "-m":
+        assert (ROOT / rest[0]).is_file()  # an example; they have tests of their own
+    elif program in ("python", "python3"):
         _, module, *arguments = rest
         if module == "venv":
             return

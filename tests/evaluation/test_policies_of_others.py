@@ -113,8 +113,8 @@ def test_stable_baselines_trains_and_is_scored(
 
 def test_the_wrappers_of_gymnax_fit(flat: FlatObservations) -> None:
     """By hand, where gymnax is installed."""
-    gymnax = pytest.importorskip("gymnax")
-    env, params = gymnax.wrappers.LogWrapper(flat), flat.default_params
+    wrappers = pytest.importorskip("gymnax.wrappers")
+    env, params = wrappers.LogWrapper(flat), flat.default_params
     obs, state = env.reset(jax.random.key(0), params)
     assert obs.shape == env.observation_space(params).shape
     *_, info = env.step(jax.random.key(1), state, jnp.int32(Action.DONE), params)
