@@ -109,7 +109,7 @@ class WordVectors:
         return lacking
 
 
-def load_bundled(path: Path | None = None) -> WordVectors:
+def load_bundled(path: Path | str | None = None) -> WordVectors:
     """The bundled vectors: 50 wide, the most frequent words of GloVe 6B.
 
     Args:

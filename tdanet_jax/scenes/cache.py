@@ -166,7 +166,7 @@ def _remove_unused(place: Path) -> None:
     A process that reads them has them open, or computes again what it does not find.
     """
     oldest = time.time() - UNUSED_DAYS * 86400
-    kinds = [f"{kind}*" for kind in (TABLES, VARIANTS, DISTANCES, IMPORTS)]
+    kinds = [*(f"{kind}*.npz" for kind in (TABLES, VARIANTS, DISTANCES)), f"{IMPORTS}*"]
     for path in [path for kind in kinds for path in place.glob(kind)]:
         with contextlib.suppress(OSError):
             if path.stat().st_mtime >= oldest:

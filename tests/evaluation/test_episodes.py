@@ -166,7 +166,9 @@ def test_in_a_house_the_room_of_the_start_says_what_is_looked_for() -> None:
                 assert drawn == world.valid_starts(scene, target, room)
     counts = Counter(home[kitchen].tolist())
     assert stats.chisquare(list(counts.values())).pvalue > 1e-6
-    rows = report.columns(tables, chosen, SimpleNamespace(shortest=0, length=0, success=0))
+    rows = report.columns(
+        tables, chosen, SimpleNamespace(shortest=0, length=0, success=0, collided=0)
+    )
     assert rows["room"].tolist() == ["kitchen"] * 2000 + ["bedroom"] * 2000
 
 

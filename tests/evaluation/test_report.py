@@ -52,7 +52,7 @@ def test_intervals_of_the_open_benchmark_resample_classes(ithor) -> None:
     chosen = Episodes(np.array(first, np.int32), goals.astype(np.int32))
     actions = np.full((60, 200), -1, np.int8)
     actions[:, 0] = 5
-    records = Records(np.ones(60, int), np.ones(60, int), goals == 1, actions)
+    records = Records(np.ones(60, int), np.ones(60, int), goals == 1, actions, np.zeros(60, bool))
     found = {}
     for split in ("open", "18/4"):
         origin = report.Provenance(split, "random", "random", 0, 0, 0, 0, ithor.data_version)

@@ -40,11 +40,17 @@ EPISODES = {
         (8, 135, "Toaster", 15, 15, False),
     ],
 }  # fmt: skip
+MEASURES = ("SR", "SPL", "CF-SR", "CF-SPL")
 #: 1,234 training episodes and so on: no number is another one's.
 ORIGIN = report.Provenance(
     "18/4", "tdanet", "sample", 1234, 3, 7, 56789, "d4t4", image="a picture", sensors=("odometry",)
 )
-HEADS = "SR L>=1 | SPL L>=1 | n L>=1 | SR L>=5 | SPL L>=5 | n L>=5 |"
+HEADS = " | ".join(f"{m} {b}" for b in ("L>=1", "L>=5") for m in (*MEASURES, "n")) + " |"
+
+
+def collided(count: int) -> list[bool]:
+    """The second of three episodes bumped into something, and so on."""
+    return [i % 3 == 1 for i in range(count)]
 
 
 def rooms() -> SceneTables:
@@ -67,7 +73,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pose = [state(p, h) for p, h in zip(place, heading, strict=True)]
         goal = [tables.targets.index(name) for name in target]
         actions = np.zeros((len(episodes), 25), np.int8)
-        records = Records(np.array(shortest), np.array(length), np.array(success), actions)
+        bumped = np.array(collided(len(episodes)))
+        records = Records(np.array(shortest), np.array(length), np.array(success), actions, bumped)
         played[group] = Episodes(np.array(pose, np.int32), np.array(goal, np.int32)), records
     folder = tmp_path_factory.mktemp("written")
     report.results(ORIGIN, tables, played, folder)
@@ -82,12 +89,13 @@ def rows(written: Path) -> Rows:
 def test_the_records_are_those_of_the_episodes(rows: Rows) -> None:
     expected = [
         (group, f"Room{place // 3}", "living_room" if place > 5 else "kitchen", target,
-         0.25 * place, 0.0, heading, 0, shortest, length, success)
+         0.25 * place, 0.0, heading, 0, shortest, length, success, bumped)
         for group, episodes in EPISODES.items()
-        for place, heading, target, shortest, length, success in episodes
+        for (place, heading, target, shortest, length, success), bumped
+        in zip(episodes, collided(len(episodes)), strict=True)
     ]  # fmt: skip
     names = ("group", "scene", "room", "target", "x", "z", "rotation", "horizon", "L", "e",
-             "success")  # fmt: skip
+             "success", "collided")  # fmt: skip
     assert [tuple(row[name] for name in names) for row in rows] == expected
     assert [len(row["actions"]) for row in rows] == [row["e"] for row in rows]
 
@@ -98,20 +106,20 @@ def figures(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     for bucket, least in (("L>=1", 1), ("L>=5", 5)):
         chosen = [row for row in rows if row["L"] >= least]
         if not chosen:
-            out[bucket] = {"SR": None, "SPL": None, "SR_ci": None, "SPL_ci": None, "n": 0}
+            out[bucket] = dict.fromkeys([*MEASURES, *(f"{m}_ci" for m in MEASURES)]) | {"n": 0}
             continue
         rate = [100.0 * row["success"] for row in chosen]
         spl = [100.0 * row["success"] * row["L"] / max(row["L"], row["e"]) for row in chosen]
         pairs = sorted({(row["scene"], row["target"]) for row in chosen})
         cluster = np.array([pairs.index((row["scene"], row["target"])) for row in chosen])
-        low, high = metrics.cluster_interval(np.array([rate, spl]), cluster)
-        out[bucket] = {
-            "SR": pytest.approx(sum(rate) / len(rate), abs=0.006),
-            "SPL": pytest.approx(sum(spl) / len(spl), abs=0.006),
-            "SR_ci": pytest.approx([low[0], high[0]], abs=0.006),
-            "SPL_ci": pytest.approx([low[1], high[1]], abs=0.006),
-            "n": len(chosen),
-        }
+        free = [[v * (not row["collided"]) for v, row in zip(values, chosen, strict=True)]
+                for values in (rate, spl)]  # fmt: skip
+        low, high = metrics.cluster_interval(np.array([rate, spl, *free]), cluster)
+        out[bucket] = {"n": len(chosen)}
+        for i, values in enumerate((rate, spl, *free)):
+            mean = sum(values) / len(values)
+            out[bucket][MEASURES[i]] = pytest.approx(mean, abs=0.006)
+            out[bucket][f"{MEASURES[i]}_ci"] = pytest.approx([low[i], high[i]], abs=0.006)
     return out
 
 
@@ -133,7 +141,8 @@ def test_results_are_those_of_loops_over_the_records(written: Path, rows: Rows) 
         "split": "18/4", "model": "tdanet", "policy": "sample", "episodes_trained": 1234, "seed": 3,
         "evaluation_seed": 7, "steps": 56789, "data_version": "d4t4", "data": None,
         "image": "a picture", "sensors": ["odometry"], "odometry": True, "triangulation": False,
-        "departures": None, "commit": report.code_version(), "version": report.RESULTS_VERSION,
+        "departures": None, "targets": "paper", "commit": report.code_version(),
+        "version": report.RESULTS_VERSION,
     }  # fmt: skip
     assert {name: out[name] for name in origin} == origin
 
@@ -143,7 +152,7 @@ def cells(first: Sequence[str], buckets: Mapping[str, Mapping[str, Any]]) -> str
     out = [*first]
     for bucket in ("L>=1", "L>=5"):
         part = buckets[bucket]
-        for name in ("SR", "SPL"):
+        for name in MEASURES:
             if part[name] is None:
                 out.append("-")
             else:
@@ -157,11 +166,12 @@ def test_the_page_of_results_line_by_line(written: Path, rows: Rows) -> None:
     """Its figures are those of `results.json`, which has been compared with the records."""
     out = json.loads((written / "results.json").read_text())
     page = [line for line in (written / "results.md").read_text().splitlines() if line]
-    rule = f"|{'---|' * 8}"
+    rule = f"|{'---|' * 12}"
     split = {
         title: metrics.summarise(*(np.array([r[n] for r in part]) for n in ("success", "L", "e")),
                                  np.unique([r["scene"] + r["target"] for r in part],
-                                           return_inverse=True)[1])
+                                           return_inverse=True)[1],
+                                 np.array([r["collided"] for r in part]))
         for title, part in (
             ("Television", chosen(rows, group="unseen", target="Television")),
             ("without Television", chosen(rows, group="unseen", target="Toaster")),
@@ -172,14 +182,15 @@ def test_the_page_of_results_line_by_line(written: Path, rows: Rows) -> None:
         "1,234 training episodes, 56,789 environment steps; sample actions, evaluation seed 7; "
         f"scene tables d4t4, code {report.code_version()}.",
         "Image: a picture.",
-        "SR and SPL in percent, with 95 % bootstrap intervals over (room, target) pairs.",
+        "SR and SPL in percent, with 95 % bootstrap intervals over (room, target) pairs. "
+        "CF-SR and CF-SPL count episodes in which a MoveAhead was blocked as failed.",
         f"| Targets | Agent | {HEADS}",
         rule,
         cells(("seen", "**tdanet, --odometry (ours)**"), out["seen"]),
-        "| seen | Random (paper) | 11.2 | 5.1 |  | - | - |  |",
-        "| seen | TDANet (paper) | 74.7 | 29.7 |  | - | - |  |",
+        "| seen | Random (paper) | 11.2 | 5.1 | - | - |  | - | - | - | - |  |",
+        "| seen | TDANet (paper) | 74.7 | 29.7 | - | - |  | - | - | - | - |  |",
         cells(("unseen", "**tdanet, --odometry (ours)**"), out["unseen"]),
-        "| unseen | TDANet (paper) | 62.5 | 25.3 |  | - | - |  |",
+        "| unseen | TDANet (paper) | 62.5 | 25.3 | - | - |  | - | - | - | - |  |",
         WORLDS_DIFFER,
         "Unseen classes with a near-synonym known in training (Television: TVStand) apart:",
         f"| Targets | Classes | {HEADS}",
@@ -204,11 +215,11 @@ def test_the_page_of_results_line_by_line(written: Path, rows: Rows) -> None:
 
 
 def distinct(start: float) -> dict[str, Any]:
-    """A result's groups, whose eight figures are eight numbers from `start` on."""
+    """A result's groups, whose sixteen figures are sixteen numbers from `start` on."""
     number = itertools.count(start, 1.5)
     return {
         group: {
-            bucket: {"SR": next(number), "SPL": next(number), "n": 40}
+            bucket: {measure: next(number) for measure in MEASURES} | {"n": 40}
             for bucket in ("L>=1", "L>=5")
         }
         for group in ("seen", "unseen")
@@ -226,13 +237,13 @@ def made_up(seed: int, start: float, policy: str = "sample", split: str = "18/4"
 
 
 COLUMNS = " | ".join(
-    f"{g} {m} {b}" for g in ("seen", "unseen") for b in ("L>=1", "L>=5") for m in ("SR", "SPL")
+    f"{g} {m} {b}" for g in ("seen", "unseen") for b in ("L>=1", "L>=5") for m in MEASURES
 )
 
 
 def numbers(start: float, text: str = "{:.1f}") -> str:
-    """The eight cells of `distinct(start)`."""
-    return " | ".join(text.format(start + 1.5 * i) for i in range(8))
+    """The sixteen cells of `distinct(start)`."""
+    return " | ".join(text.format(start + 1.5 * i) for i in range(16))
 
 
 def test_the_page_of_a_comparison_line_by_line() -> None:
@@ -240,8 +251,8 @@ def test_the_page_of_a_comparison_line_by_line() -> None:
     gap = {
         group: {
             bucket: {m: v for m, v in part.items() if m != "n"}
-            | {"SR_ci": [part["SR"] - 8, part["SR"] + 9]}
-            | {"SPL_ci": [part["SPL"] - 6, part["SPL"] + 7]}
+            | {f"{m}_ci": [part[m] - 8, part[m] + 9] for m in ("SR", "CF-SR")}
+            | {f"{m}_ci": [part[m] - 6, part[m] + 7] for m in ("SPL", "CF-SPL")}
             for bucket, part in buckets.items()
         }
         for group, buckets in distinct(-3.0).items()
@@ -249,27 +260,28 @@ def test_the_page_of_a_comparison_line_by_line() -> None:
     results[1]["difference"] = {"to": "runs/0", **gap}
     shown = [
         f"{v:.1f} ({v - 8 + 2 * (i % 2):.1f} to {v + 9 - 2 * (i % 2):.1f})"
-        for i, v in enumerate(-3.0 + 1.5 * i for i in range(8))
+        for i, v in enumerate(-3.0 + 1.5 * i for i in range(16))
     ]
     page = comparison.markdown("Title", results, ["a", "b", "c"])
     head = f"| Agent | Updates | Training episodes | Actions | {COLUMNS} |"
     assert [line for line in page.splitlines() if line] == [
         "# Title",
-        "SR and SPL in percent, test rooms.",
+        "SR and SPL in percent, test rooms. CF-SR and CF-SPL count episodes in which a MoveAhead "
+        "was blocked as failed.",
         "## Split 18/4",
         head,
-        f"|{'---|' * 12}",
+        f"|{'---|' * 20}",
         f"| a | 2,000 | 3,000 | sample | {numbers(10.0)} |",
         f"| b | 2,001 | 3,001 | sample | {numbers(30.0)} |",
         f"| b minus a |  |  | sample | {' | '.join(shown)} |",
         f"| **tdanet, 2 seeds** |  |  | sample | {numbers(20.0, '{:.1f} ± 14.1')} |",
-        "| Random (paper) |  |  |  | 11.2 | 5.1 | - | - | - | - | - | - |",
-        "| TDANet (paper) |  |  |  | 74.7 | 29.7 | - | - | 62.5 | 25.3 | - | - |",
+        f"| Random (paper) |  |  |  | 11.2 | 5.1 {'| - ' * 14}|",
+        f"| TDANet (paper) |  |  |  | 74.7 | 29.7 {'| - ' * 6}| 62.5 | 25.3 {'| - ' * 6}|",
         "Differences: in the same episodes, 95 % intervals (paired bootstrap).",
         WORLDS_DIFFER,
         "## Split 14/8",
         head,
-        f"|{'---|' * 12}",
+        f"|{'---|' * 20}",
         f"| c | 2,005 | 3,005 | greedy | {numbers(60.0)} |",
     ]
 
@@ -285,7 +297,7 @@ def test_a_curve_has_each_figure_at_its_own_point() -> None:
     found = comparison.curve("label", runs)
     assert found.episodes == [103.0, 203.0]
     for i, key in enumerate(
-        (("seen", "SR"), ("seen", "SPL"), None, None, ("unseen", "SR"), ("unseen", "SPL"))
+        (("seen", "SR"), ("seen", "SPL"), *[None] * 6, ("unseen", "SR"), ("unseen", "SPL"))
     ):
         if key is not None:
             means = [spread.mean for spread in found.values[key] if spread is not None]

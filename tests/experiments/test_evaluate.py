@@ -160,7 +160,7 @@ def test_what_was_half_written_is_no_obstacle(tmp_path, monkeypatch):
     class Done:
         saved = SavedNetwork(tmp_path / "a", TINY)
         snapshot = SimpleNamespace(updates=10)
-        task = SimpleNamespace(tables=SimpleNamespace(room_types=ROOM_TYPES))
+        task = SimpleNamespace(tables=SimpleNamespace(room_types=ROOM_TYPES, targets=()))
         played = None
 
         def results(self):
@@ -200,7 +200,7 @@ def test_only_a_point_of_a_history_has_a_share_of_the_budget(tmp_path, point, sh
     done = saved_networks.Evaluated(
         SavedNetwork(tmp_path, TINY, point),
         snapshot,
-        SimpleNamespace(tables=SimpleNamespace(room_types=ROOM_TYPES)),
+        SimpleNamespace(tables=SimpleNamespace(room_types=ROOM_TYPES, targets=())),
         provenance,
         {},
     )

@@ -35,6 +35,7 @@ from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.tdanet import TDANetEncoder
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.scenes import SceneTables
+from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.task import load_task, make_task
 from tdanet_jax.training import learner
 from tdanet_jax.training.callbacks import Callbacks
@@ -106,8 +107,11 @@ TRACE = SimpleNamespace(scene="FloorPlan1", target="Mug", outcome="success", pla
 
 def agents(recorder: Recorder, last: str) -> None:
     """The commands that show an episode."""
-    player = SimpleNamespace(name="one", attends=True, task=None)
-    recorder.record("tdanet_jax.scenes.dataset.load_rooms", gives=SimpleNamespace(tables="rooms"))
+    tables = Tables("FloorPlan1")
+    task = SimpleNamespace(tables=tables)
+    player = SimpleNamespace(name="one", attends=True, task=task)
+    recorder.record("tdanet_jax.scenes.dataset.load_rooms", gives=Rooms(tables, None))
+    recorder.record("tdanet_jax.scenes.target_distances.with_targets", gives=tables)
     recorder.record("tdanet_jax.analysis.trace.load_player", gives=player)
     recorder.record(f"{EPISODE}.find", gives="an episode")
     recorder.record(f"{EPISODE}.read_record", gives=lambda: Record("a record"))
@@ -166,8 +170,9 @@ def prepare_scenes(recorder: Recorder) -> None:
     tables = Tables("FloorPlan1", "FloorPlan2")
     scene = SimpleNamespace(name="FloorPlan1", points=np.zeros((9, 3)))
     recorder.record("tdanet_jax.tools.build_assets.build", gives=())
-    for part in ("grid.summary", "agreement.table", "survey.summary", "survey.uses"):
+    for part in ("grid.summary", "agreement.table", "survey.uses"):
         recorder.record(f"tdanet_jax.scenes.checks.{part}", gives=())
+    recorder.record("tdanet_jax.scenes.checks.survey.summary", gives=lambda: iter(["some rooms"]))
     recorder.record("tdanet_jax.scenes.checks.dense_rays.summary", gives="")
     recorder.record("tdanet_jax.scenes.ithor.load_scenes", gives=lambda: [scene] * 9)
     recorder.record("tdanet_jax.scenes.ithor.published_points", gives=None)
@@ -176,7 +181,17 @@ def prepare_scenes(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.scenes.tabulation.build", gives=tables)
     recorder.record("tdanet_jax.analysis.pictures.most_telling_state", gives=0)
     recorder.record("tdanet_jax.analysis.pictures.room", gives=Ended)
-    rooms = SimpleNamespace(tables=tables, extras=None)
+    rooms = SimpleNamespace(
+        tables=tables, extras=None, records=None, scenes=lambda names: [scene] * len(names)
+    )
+    parts = SimpleNamespace(train_scenes=("FloorPlan1",), eval_scenes=("FloorPlan2",))
+    recorder.record("tdanet_jax.scenes.dataset.assign_rooms", gives=parts)
+    recorder.record("tdanet_jax.scenes.placement.statistics", gives="statistics")
+    recorder.record("tdanet_jax.scenes.vary.vary", gives="a variant")
+    recorder.record("tdanet_jax.analysis.pictures.plans", gives=Ended)
+    recorder.record("tdanet_jax.scenes.variants.make", gives=rooms)
+    recorder.record("tdanet_jax.scenes.checks.survey.making", gives=())
+    recorder.record("tdanet_jax.evaluation.room_statistics.table", gives=Ended)
     recorder.record("tdanet_jax.scenes.dataset.load_rooms", gives=rooms)
     recorder.record("tdanet_jax.scenes.dataset.build_rooms", gives=rooms)
     recorder.record("tdanet_jax.scenes.dataset.save_rooms", gives=Ended)
@@ -257,6 +272,7 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--episodes": "--episodes 9",
             "--scenes": "--scenes FloorPlan21",
             "--targets": "--targets Mug",
+            "--noise": "--noise mix",
             "--seed": "--seed 5",
             "--out": "--out new",
         },
@@ -337,9 +353,21 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--horizon": ("FloorPlan1 --position 1 2", "FloorPlan1 --position 1 2 --horizon 30"),
             "--scenes": "--scenes rooms.json",
             "--data": "--data rooms.npz",
+            "--variants": ("FloorPlan1 --variants 2", "FloorPlan1 --variants 3"),
             "--out": "--out new.png",
         },
     ),
+    "scenes vary": (
+        "--out new.npz",
+        {
+            "--out": ("--out new.npz", "--out newer.npz"),
+            "--copies": "--copies 2",
+            "--seed": "--seed 2",
+            "--part": "--part all",
+            "--data": "--data rooms.npz",
+        },
+    ),
+    "scenes compare": ("rooms.npz", {"--data": "--data others.npz"}),
     "scenes import": (
         "--from folder",
         {
@@ -445,6 +473,8 @@ SHOWN = {
     "_sees_those_of_the_rooms",
     "steps": "training/test_run.py::test_the_budget_in_steps_is_kept_and_every_chunk_has_a_row",
     "episodes": "training/test_run.py::test_the_budget_in_episodes_ends_the_run",
+    "targets": "test_targets.py::test_any_target_can_be_unseen",
+    "variants": "scenes/test_variants.py::test_a_run_trains_in_variants_and_is_evaluated_as_ever",
     "minutes": "training/test_run_bookkeeping.py::test_time_and_rows_continue",
     "seed": "training/test_run.py::test_another_seed_gives_another_run",
     "validation": "test_splits.py::test_validation_touches_neither_test_rooms_nor_unseen_classes",
@@ -468,7 +498,7 @@ OF_THE_TASK: dict[str, tuple[Any, str]] = {
     "odometry": (True, "tdanet"), "triangulation": (True, "tdanet"),
     "sensors": (("odometry",), "tdanet"), "inner_rate": (0.1, "savn"),
     "first_order": (True, "savn"), "precision": ("bfloat16", "tdanet"), "split": ("14/8", "tdanet"),
-    "model": ("ssnet", "tdanet"),
+    "model": ("ssnet", "tdanet"), "noise": ("mix", "tdanet"),
 }  # fmt: skip
 #: Settings with a test of their own below.
 HERE = ("data", "word_vectors", "checkpoint_minutes")
