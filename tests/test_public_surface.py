@@ -118,6 +118,7 @@ def test_a_run_from_python_is_stopped_resumed_and_evaluated(tmp_path: Path) -> N
     assert [one["policy"] for one in several] == ["greedy"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ithor", "few_episodes")
 def test_policies_without_a_checkpoint(tmp_path: Path) -> None:
     random = policies.random()

@@ -149,6 +149,7 @@ def test_the_pixels_of_a_box_are_those_that_it_touches(rooms, some_rooms):
     assert grown.max() <= 16
 
 
+@pytest.mark.slow
 def test_an_episode_is_the_one_of_the_environment(run, agent, rooms):
     player = trace.load_player(run, Rooms(rooms, None))
     chosen = episodes.draw(rooms, player.task.split.eval_scenes, TARGETS, 5, seed=1)

@@ -17,6 +17,7 @@ def notebook():
     return nbformat.read(NOTEBOOK, as_version=4)
 
 
+@pytest.mark.slow
 def test_it_runs(notebook, opinionated_run, tmp_path):
     first = next(cell for cell in notebook.cells if cell.cell_type == "code")
     (name,) = re.findall(r'^RUN = "(.*)"', first.source, re.MULTILINE)

@@ -104,6 +104,7 @@ def test_paths_of_two_runs_and_the_shortest_are_drawn(
     assert [path.name for path in out.parent.iterdir()] == ["paths.svg"]
 
 
+@pytest.mark.slow
 def test_an_episode_is_animated(tmp_path, rooms_file, opinionated_run):
     out = tmp_path / "episode.gif"
     chosen = ["--episode", "3", "--data", str(rooms_file), "--out", str(out)]

@@ -130,7 +130,7 @@ def perturbed(scenes: list[Scene], names: tuple[str, ...]) -> list[Scene]:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("validation", [False, True])
+@pytest.mark.parametrize("validation", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_nothing_of_the_rooms_of_the_evaluation_is_in_variants(
     rooms: Rooms,
     scenes: list[Scene],

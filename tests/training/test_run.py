@@ -184,6 +184,7 @@ def test_the_budget_in_episodes_ends_the_run(task, tmp_path):
     assert (last.point, last.episodes) == (8, int(run.state.episodes))
 
 
+@pytest.mark.slow
 def test_a_run_that_is_no_longer_finite_stops_with_its_state_saved(task, tmp_path):
     run = Run(tmp_path, dataclasses.replace(TINY, max_skipped=4, history=0), task)
     broken = jax.tree.map(lambda leaf: leaf * np.nan, run.state.params)

@@ -228,6 +228,7 @@ def assert_gradients_close(found: Any, expected: Any) -> None:
             np.testing.assert_allclose(mine, theirs, rtol=1e-3, atol=2e-4 * scale, err_msg=name)
 
 
+@pytest.mark.slow
 def test_the_inner_steps_change_what_follows_them_and_no_other_episode() -> None:
     _, out = play(MODEL, parameters(), start(parameters()), inputs())
     still = dataclasses.replace(MODEL, rate=0.0)

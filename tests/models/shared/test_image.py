@@ -100,6 +100,7 @@ def test_the_fast_forms_equal_the_published_network(model: ActorCritic, dropped:
     np.testing.assert_allclose(out.value, value, **CLOSE)
 
 
+@pytest.mark.slow
 @CASES
 def test_the_fast_forms_have_the_gradient_of_the_published_network(
     model: ActorCritic, dropped: bool
