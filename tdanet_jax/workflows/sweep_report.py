@@ -91,6 +91,7 @@ def to_json(report: Report) -> dict[str, Any]:
         },
         "paper": [rate._asdict() for rate in paper.RATES],
         "paper_parameters_mebi": paper.PARAMETERS,
+        "paper_milliseconds": paper.MILLISECONDS,
         "costs": {label: dataclasses.asdict(cost) for label, cost in report.costs.items()},
         "learning_curves": {
             split: {
@@ -240,20 +241,23 @@ def _costs(report: Report) -> Iterator[str]:
     """Parameters and inference time."""
     batches = list(dict.fromkeys(b for cost in report.costs.values() for b in cost.milliseconds))
     times = (f"ms, batch {batch:,}" for batch in batches)
-    heads = ["Model", "Parameters", "in 2^20", "in 2^20, paper", *times]
+    heads = ["Model", "Parameters", "in 2^20", "in 2^20, paper", *times, "ms, paper"]
     yield from ("", "## Parameters and inference time", "")
     yield from (f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}")
     for label, cost in sorted(report.costs.items(), key=lambda item: _place(item[1].model)):
-        published = paper.PARAMETERS.get(paper.NAMES.get(cost.model, ""))
+        name = paper.NAMES.get(cost.model, "")
+        published, milliseconds = paper.PARAMETERS.get(name), paper.MILLISECONDS.get(name)
         cells = [
             in_markdown(label),
             f"{cost.parameters:,}",
             f"{cost.parameters / 2**20:.2f}",
             "-" if published is None else f"{published:.2f}",
             *(f"{cost.milliseconds[batch]:.2f}" for batch in batches),
+            "-" if milliseconds is None else f"{milliseconds:.1f}",
         ]
         yield f"| {' | '.join(cells)} |"
     yield from ("", f"Time of one decision for a batch of agents, on {report.machine}.")
+    yield "The paper's time is that of one decision on an NVIDIA GeForce RTX 3060."
     yield "The paper's word vectors have 300 dimensions; here, the input layers fit the run's."
 
 
