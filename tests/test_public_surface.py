@@ -185,6 +185,7 @@ for group, pair in played.items():
 """
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:tdanet_jax:DeprecationWarning")
 @pytest.mark.usefixtures("ithor", "few_episodes")
 def test_the_examples_of_the_last_version_run(capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from tdanet_jax.config import TrainConfig
 from tests.support.pages import PAGES, ROOT, Block, blocks
 
 #: Pages whose blocks take long: by hand.
-SLOW = ("docs/analysis.md",)
+SLOW = ("docs/analysis.md", "docs/trainers.md")
 
 
 def runs(one: Block) -> bool:

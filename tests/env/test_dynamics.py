@@ -189,6 +189,7 @@ def test_agrees_with_the_slow_world_in_real_rooms(ithor: SceneTables) -> None:
     assert successes > 10, "the walk should reach targets, or little has been compared"
 
 
+@pytest.mark.slow
 def test_agrees_with_the_slow_world_in_rooms_built_from_boxes() -> None:
     rng = np.random.default_rng(10)
     rooms = [toy.random_room(rng, name=f"Random{i}") for i in range(8)]
@@ -563,7 +564,9 @@ def test_rotations_of_other_grids_are_uniform_and_independent_of_the_target(rota
             )
 
 
-@pytest.mark.parametrize("real", [True, False], ids=["real rooms", "houses"])
+@pytest.mark.parametrize(
+    "real", [pytest.param(True, marks=pytest.mark.slow), False], ids=["real rooms", "houses"]
+)
 def test_every_valid_episode_is_offered_and_no_other(ithor: SceneTables, real: bool) -> None:
     tables = ithor.subset(("FloorPlan29", "FloorPlan402"))  # unconnected; connected
     targets, ahead = TARGETS, oracle.walk_on_grid(tables)

@@ -76,6 +76,7 @@ def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("recurrent_ppo")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_episodes")
 def test_the_example_trains_and_is_scored(
     example: ModuleType, flat: FlatObservations, config: TrainConfig

@@ -86,6 +86,7 @@ def test_a_picture_of_an_unknown_kind_is_refused(tmp_path, capsys, rooms_file, o
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_paths_of_two_runs_and_the_shortest_are_drawn(
     tmp_path, capsys, rooms_file, opinionated_run
 ):
@@ -182,6 +183,7 @@ def test_a_model_that_sees_an_image_and_adapts_is_shown_next_to_another(
     assert f"{run}: this model has no attention" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_model_that_was_trained_on_feature_maps_sees_those_of_the_rooms(
     tmp_path, monkeypatch, capsys, rooms_file, glove
 ):

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 
 from experiments import scaling
 from tdanet_jax.config import TrainConfig
@@ -19,6 +20,7 @@ def test_few_rooms_hold_all_types(ithor, glove):
     assert len(more.row_class) == len(params.row_class) + 9
 
 
+@pytest.mark.slow
 def test_it_writes_figures_and_a_plot(tmp_path, monkeypatch, ithor):
     def cost(model, words, params, count, repeats):
         return {"steps_per_second": count, "temporary_mb": len(words), "arguments_mb": 1.0}

@@ -289,6 +289,7 @@ def test_export_says_what_it_leaves_out(tmp_path: Path, capsys: pytest.CaptureFi
     assert "Left out" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_variants_are_written_compared_and_drawn(
     ithor: SceneTables,
     tmp_path: Path,

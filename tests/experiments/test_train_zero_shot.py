@@ -99,6 +99,7 @@ def test_it_trains_evaluates_and_goes_on_after_kill_and_term(ithor, tmp_path, ca
     assert results["seen"]["L>=1"]["n"] == results["unseen"]["L>=1"]["n"] == 1000
 
 
+@pytest.mark.slow
 def test_a_split_of_ones_own_is_trained_evaluated_and_gone_on_with(
     ithor, few_episodes, tmp_path, monkeypatch, capsys
 ):

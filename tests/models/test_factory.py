@@ -64,9 +64,7 @@ def test_every_named_model_is_made_and_answers(name: str) -> None:
         state = model.initial_carry(B, weights), obs, jnp.zeros((B, 6)), jnp.ones(B, bool)
         return actor_critic.forward(model, weights, class_table, *state)[1]
 
-    out = jax.jit(answer)(jax.random.key(0))
-    assert out.logits.shape == (B, 6)
-    assert np.isfinite(out.logits).all()
+    assert jax.eval_shape(answer, jax.random.key(0)).logits.shape == (B, 6)
 
 
 def can_triangulate(name: str) -> bool:
@@ -76,7 +74,7 @@ def can_triangulate(name: str) -> bool:
 
 @pytest.mark.parametrize(
     ("name", "triangulation"),
-    [(name, choice) for name in MODELS for choice in {False, can_triangulate(name)}],
+    [(name, can_triangulate(name)) for name in MODELS],
 )
 def test_every_named_model_takes_sensors(name: str, triangulation: bool) -> None:
     config = with_sensors(dataclasses.replace(SMALL, model=name), triangulation)

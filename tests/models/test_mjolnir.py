@@ -73,11 +73,8 @@ def test_the_features_are_those_of_the_published_equations() -> None:
     np.testing.assert_allclose(found, np.stack(expected), **CLOSE)
 
 
-@pytest.mark.parametrize(
-    "from_cache",
-    [pytest.param(False, marks=pytest.mark.slow), True],
-    ids=["computed", "from the cache"],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("from_cache", [False, True], ids=["computed", "from the cache"])
 def test_the_gradient_is_that_of_the_published_equations(from_cache: bool) -> None:
     obs = observations(T, B)
     mix = np.random.default_rng(4).normal(size=(T, B, H + 5 * len(KNOWN))).astype(np.float32)

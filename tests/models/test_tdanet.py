@@ -86,7 +86,20 @@ def test_the_fast_forms_equal_the_printed_equations(
     np.testing.assert_allclose(fast, np.stack(plain), **CLOSE)
 
 
-@pytest.mark.parametrize(("attention", "siamese"), ABLATIONS, ids=IDS)
+@pytest.mark.parametrize(
+    ("backend", "attention", "siamese"),
+    [
+        ("cpu", True, True), ("cpu", False, True), ("gpu", True, True),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                ("cpu", True, False), ("cpu", False, False), ("gpu", False, True),
+                ("gpu", True, False), ("gpu", False, False),
+            )
+        ),
+    ],
+    indirect=["backend"],
+)  # fmt: skip
 def test_the_fast_forms_have_the_gradient_of_the_printed_equations(
     attention: bool, siamese: bool, backend: None
 ) -> None:

@@ -165,6 +165,7 @@ def test_nothing_of_the_rooms_of_the_evaluation_is_in_variants(
     assert version_without(("FloorPlan15",)) != version
 
 
+@pytest.mark.slow
 def test_a_run_trains_in_variants_and_is_evaluated_as_ever(rooms: Rooms) -> None:
     plain = task_in(rooms, TrainConfig(network=SMALL))
     task = task_in(rooms, TrainConfig(network=SMALL, variants=2))

@@ -319,6 +319,7 @@ def test_a_failed_turn_turns_what_the_agent_believes_alone(some_rooms: SceneTabl
     assert int(out.state.sensors["odometry"].heading) == 1
 
 
+@pytest.mark.slow
 def test_jit_is_eager_and_vmap_a_loop() -> None:
     seen, corners = frame_of(TABLE[:K])
     bits = jax.random.bits(jax.random.key(1), (3, 8, K + SPARE + 1), jnp.uint16)

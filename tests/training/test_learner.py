@@ -251,6 +251,7 @@ def test_the_activation_cache_changes_neither_the_loss_nor_its_gradient(sensors:
         assert all(np.asarray(grad).any() for grad in cached[1]["way"].values())
 
 
+@pytest.mark.slow
 def test_sensor_states_begin_with_every_episode_and_last_as_long_as_it() -> None:
     _, after, steps, *_ = example(sensors=True)
     whole = jax.tree.map(
@@ -398,6 +399,7 @@ def test_an_update_is_one_step_of_clipped_adam_on_the_gradient_of_the_loss(
         chex.assert_trees_all_close(state.params, expected, rtol=1e-4, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_only_large_kernels_are_rounded_while_acting() -> None:
     model = ActorCritic(TDANetEncoder(width=12, dtype=jnp.bfloat16), hidden=8, dtype=jnp.bfloat16)
     state = start(1)

@@ -36,7 +36,7 @@ DATA = Path(__file__).parents[1] / "data"
 NAMES = ("run_format_1_best", "run_format_1_savn")
 
 
-@pytest.fixture(params=NAMES)
+@pytest.fixture(params=[NAMES[0], pytest.param(NAMES[1], marks=pytest.mark.slow)])
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return shutil.copytree(DATA / request.param, tmp_path / request.param)
 
@@ -63,9 +63,6 @@ def test_all_its_arrays_are_known_by_the_names_of_today(run: Path, task: Task) -
             np.testing.assert_array_equal(known[name], leaf, err_msg=name)
 
 
-@pytest.mark.parametrize(
-    "run", [NAMES[0], pytest.param(NAMES[1], marks=pytest.mark.slow)], indirect=True
-)
 def test_it_resumes_and_is_saved_with_the_names_of_today(run: Path, task: Task) -> None:
     again = Run(run, configs.load(run / CONFIG_FILE), task)
     updates = int(again.state.updates)
@@ -79,6 +76,7 @@ def test_it_resumes_and_is_saved_with_the_names_of_today(run: Path, task: Task) 
     assert meta["format"] == FORMAT == 2
 
 
+@pytest.mark.slow
 def test_it_plays(run: Path, task: Task, ithor: SceneTables) -> None:
     lists = episodes.load(ithor, task.split)
     few = {name: Episodes(found.pose[::250], found.target[::250]) for name, found in lists.items()}

@@ -175,6 +175,7 @@ def test_another_seed_gives_another_run(whole, task, tmp_path):
     assert without_times(rows) != without_times(whole[2][:1])
 
 
+@pytest.mark.slow
 def test_the_budget_in_episodes_ends_the_run(task, tmp_path):
     run = Run(tmp_path, dataclasses.replace(TINY, episodes=5), task)
     list(run.chunks())

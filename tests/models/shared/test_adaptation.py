@@ -256,6 +256,7 @@ def test_the_plain_network_is_the_one_that_adapts() -> None:
     chex.assert_trees_all_close(out, plain, **CLOSE)
 
 
+@pytest.mark.slow
 def test_a_rollout_equals_its_steps_and_stores_the_same() -> None:
     params, given = parameters(), inputs()
     state, outs = start(params), []

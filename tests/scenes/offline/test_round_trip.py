@@ -149,6 +149,7 @@ def test_the_graph_is_the_reference_controllers(some_rooms: SceneTables) -> None
         assert len(neighbours[key]) == 3 + moved
 
 
+@pytest.mark.slow
 def test_what_older_code_reads(some_rooms: SceneTables, tmp_path: Path) -> None:
     pytest.importorskip("h5py")
     room = some_rooms.subset(["FloorPlan428"])
