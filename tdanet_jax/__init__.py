@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from tdanet_jax import _moved
 
 if TYPE_CHECKING:
-    from tdanet_jax.agent import Agent, Decision, Detection, load
+    from tdanet_jax.agent import Agent, Camera, Decision, Detection, load
     from tdanet_jax.config import EvalConfig, LearnerConfig, NetworkConfig, TrainConfig
     from tdanet_jax.task import make
     from tdanet_jax.training.callbacks import Callbacks
@@ -25,6 +25,7 @@ __version__ = "0.2.0"
 _PUBLIC = {
     "Agent": "agent",
     "Callbacks": "training.callbacks",
+    "Camera": "agent",
     "Decision": "agent",
     "Detection": "agent",
     "EvalConfig": "config",
@@ -40,6 +41,7 @@ _PUBLIC = {
 __all__ = [
     "Agent",
     "Callbacks",
+    "Camera",
     "Decision",
     "Detection",
     "EvalConfig",

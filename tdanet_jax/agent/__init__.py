@@ -1,5 +1,32 @@
-"""A trained agent on its own: detections in, actions out."""
+"""A trained agent on its own: detections in, actions out.
 
-from tdanet_jax.agent.agent import Agent, AgentState, Decision, Detection, load
+Names are imported when they are first used: detections and cameras need no JAX.
+"""
 
-__all__ = ["Agent", "AgentState", "Decision", "Detection", "load"]
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tdanet_jax.agent.agent import Agent, AgentState, Decision, load
+    from tdanet_jax.agent.camera import Camera
+    from tdanet_jax.agent.detection import Detection
+
+#: Public names, and the module that each is in.
+_MODULES = {
+    "Agent": "agent",
+    "AgentState": "agent",
+    "Camera": "camera",
+    "Decision": "agent",
+    "Detection": "detection",
+    "load": "agent",
+}
+
+__all__ = ["Agent", "AgentState", "Camera", "Decision", "Detection", "load"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"tdanet_jax.agent.{_MODULES[name]}"), name)
+    raise AttributeError(f"tdanet_jax.agent has no {name}")

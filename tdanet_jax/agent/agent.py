@@ -8,7 +8,6 @@ state, decision = agent.act(state, [Detection("mug", 0.2, 0.3, 0.25, 0.4)], targ
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +18,7 @@ import numpy as np
 
 from tdanet_jax import config as configs
 from tdanet_jax import words
+from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors
 from tdanet_jax.env.types import Observation
 from tdanet_jax.labels import LabelError, Labels, Synonyms
@@ -37,63 +37,6 @@ from tdanet_jax.words import WordVectors
 
 #: Rows and labels are padded to multiples of these, so that few shapes are ever compiled.
 ROW_BLOCK, LABEL_BLOCK = 16, 64
-
-
-#: Share of the image by which a detection's box may reach beyond it: a pixel of any image of at
-#: least 100 pixels, and more than what rounding adds in half precision or eight bits.
-OVERHANG = 0.01
-
-
-@dataclasses.dataclass(frozen=True)
-class Detection:
-    """One detected object: a label in English and its box as shares of the image, y down.
-
-    A box that reaches up to 1% (`OVERHANG`) beyond the image, as detectors round, is clipped to the
-    image; `clipped` does so with any box.
-    """
-
-    label: str
-    x1: float
-    y1: float
-    x2: float
-    y2: float
-
-    def __post_init__(self) -> None:
-        """Clips the box.
-
-        Raises:
-          ValueError: a corner is not finite or too far outside of the image, corners are in the
-            wrong order, or the whole box is outside.
-        """
-        corners = (self.x1, self.y1, self.x2, self.y2)
-        if not all(-OVERHANG <= corner <= 1 + OVERHANG for corner in corners):
-            raise ValueError(
-                f"{self}: corners must be shares of the image; for boxes that reach beyond it, "
-                "Detection.clipped"
-            )
-        for side, corner in zip(("x1", "y1", "x2", "y2"), _clip(self.label, corners), strict=True):
-            object.__setattr__(self, side, corner)
-
-    @classmethod
-    def clipped(cls, label: str, x1: float, y1: float, x2: float, y2: float) -> Detection:
-        """A detection whose box may reach beyond the image however far; it is clipped to it.
-
-        Raises:
-          ValueError: a corner is not finite, corners are in the wrong order, or the whole box is
-            outside of the image.
-        """
-        return cls(label, *_clip(label, (x1, y1, x2, y2)))
-
-
-def _clip(label: str, corners: tuple[float, ...]) -> tuple[float, ...]:
-    """The part of a box that is inside the image."""
-    x1, y1, x2, y2 = whole = tuple(map(float, corners))
-    if not (all(map(math.isfinite, whole)) and x1 <= x2 and y1 <= y2):
-        raise ValueError(f"{label} at {whole}: corners must be finite, x1 <= x2 and y1 <= y2")
-    left, top, right, bottom = inside = tuple(min(max(corner, 0.0), 1.0) for corner in whole)
-    if (left == right and x1 != x2) or (top == bottom and y1 != y2):
-        raise ValueError(f"{label} at {whole}: the box is outside of the image")
-    return inside
 
 
 class AgentState(NamedTuple):

@@ -16,7 +16,7 @@ import tdanet_jax
 from experiments import share
 from experiments.train_zero_shot import main as train
 from tdanet_jax import Agent, Callbacks, words
-from tdanet_jax.agent.agent import Detection
+from tdanet_jax.agent.detection import Detection
 from tdanet_jax.analysis import trace
 from tdanet_jax.config import WORD_VECTORS_FILE, EvalConfig
 from tdanet_jax.evaluation import report, saved_networks

@@ -16,7 +16,7 @@ import pytest
 
 import tdanet_jax
 from experiments import evaluate, scenes, train_zero_shot
-from tdanet_jax.agent.agent import Detection
+from tdanet_jax.agent.detection import Detection
 from tdanet_jax.io import files
 from tdanet_jax.scenes import SceneTables, dataset
 from tdanet_jax.scenes.offline import features, importer

@@ -10,7 +10,7 @@ import pytest
 
 import tdanet_jax
 from experiments.running import how_to_continue
-from tdanet_jax.agent.agent import Detection
+from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.factory import make_model

@@ -17,7 +17,7 @@ import pytest
 
 import tdanet_jax
 from tdanet_jax import config as configs
-from tdanet_jax.agent.agent import Detection
+from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import CONFIG_FILE
 from tdanet_jax.evaluation import episodes, policies, rollout
 from tdanet_jax.evaluation.episodes import Episodes
