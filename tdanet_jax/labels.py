@@ -96,7 +96,7 @@ class Labels:
 
         Raises:
           LabelError: it means nothing that is known, and a word has no vector; the message names
-            the most similar labels that are known.
+            the most similar labels that are known, and how to add a word or a name.
         """
         if (name := self.find(label)) is not None:
             return name
@@ -108,7 +108,8 @@ class Labels:
         near = self.near(first)
         problem = f"no word vector for {lacking}" if lacking else "has no words"
         question = f"; did you mean {' or '.join(near)}?" if near else ""
-        raise LabelError(f"label {label!r}: {problem}{question}")
+        way_out = " (agent.add_words adds words, synonyms add names)" if lacking else ""
+        raise LabelError(f"label {label!r}: {problem}{question}{way_out}")
 
     def near(self, label: str) -> list[str]:
         """The most similar names that are known, the most similar first."""

@@ -11,7 +11,7 @@ import codecs
 import dataclasses
 import io
 import zipfile
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +69,20 @@ class WordVectors:
         if lacking:
             raise ValueError(f"no word vectors for {', '.join(lacking)}; --word-vectors FILE")
         return np.stack([self.embed(name, norm) for name in names])
+
+    def extended(self, more: WordVectors, source: Path | str = "words") -> WordVectors:
+        """With the words of others that it lacks, after its own.
+
+        Raises:
+          ValueError: their vectors are of another length; the message begins with `source`.
+        """
+        width, others = self.vectors.shape[1], more.vectors.shape[1]
+        if width != others:
+            raise FileError(source, f"vectors of {others} numbers, where the others have {width}")
+        new = [word for word in more.index if word not in self.index]
+        index = self.index | {word: len(self.index) + i for i, word in enumerate(new)}
+        rows = more.vectors[[more.index[word] for word in new]]
+        return WordVectors(index, np.concatenate([self.vectors, rows]))
 
     def save_copy(self, path: Path | str, names: Iterable[str]) -> None:
         """Writes the vectors of some names exactly, and those of other words in 16 bits.
@@ -144,7 +158,38 @@ def load_word_vectors(path: str | Path | None, names: Iterable[str] = ()) -> Wor
     raise FileError(path, "word vectors are a .txt, .hdf5 or .npz file")
 
 
-def _load_text(path: Path, wanted: Collection[str]) -> WordVectors:
+def read_words(source: Mapping[str, Sequence[float]] | Path | str) -> WordVectors:
+    """All word vectors of a mapping, or of a file as `load_word_vectors` reads it.
+
+    Raises:
+      ValueError: an entry of the mapping is not a name with a vector; the message names it.
+      FileError: the file is missing, or has none of these formats.
+    """
+    if not isinstance(source, Mapping):
+        path = Path(source)
+        return _load_text(path) if path.suffix == ".txt" else load_word_vectors(path)
+    found: dict[str, np.ndarray] = {}
+    for name, numbers in source.items():
+        key = " ".join(class_words(name))
+        try:
+            row = np.array(numbers, np.float32)
+        except (TypeError, ValueError):
+            row = np.zeros(0, np.float32)
+        if row.ndim != 1 or not 0 < len(row) <= WIDEST or not np.isfinite(row).all():
+            raise ValueError(f"word {name!r}: not a vector of finite numbers")
+        if not key or key in found:
+            raise ValueError(f"word {name!r}: {'is there twice' if key else 'is no word'}")
+        if found and len(row) != len(next(iter(found.values()))):
+            raise ValueError(f"word {name!r}: its vector is not as long as the others")
+        found[key] = row
+    if not found:
+        raise ValueError("no words")
+    index = {word: i for i, word in enumerate(found)}
+    return WordVectors(index, np.stack([*found.values()]))
+
+
+def _load_text(path: Path, wanted: Collection[str] | None = None) -> WordVectors:
+    """Of a text file, the first words and the wanted ones; all if that is None."""
     index: dict[str, int] = {}
     rows: list[np.ndarray] = []
     if not path.is_file():
@@ -154,7 +199,7 @@ def _load_text(path: Path, wanted: Collection[str]) -> WordVectors:
             file.seek(0)
         for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b"")):
             word = line.partition(b" ")[0].decode("utf-8", "replace")
-            if number >= ASSET_WORDS and word not in wanted:
+            if wanted is not None and number >= ASSET_WORDS and word not in wanted:
                 continue
             try:
                 row = np.array(line.split()[1:], np.float32)

@@ -144,7 +144,10 @@ def test_a_word_without_a_vector_is_split_into_two(
 @pytest.mark.parametrize(
     ("label", "message"),
     [
-        ("qwertzu", "label 'qwertzu': no word vector for qwertzu"),
+        (
+            "qwertzu",
+            "label 'qwertzu': no word vector for qwertzu (agent.add_words adds words, synonyms add",
+        ),
         (
             "televison",
             "label 'televison': no word vector for televison; did you mean Television?",

@@ -193,3 +193,43 @@ def test_a_copy_has_the_classes_exactly_and_the_other_words_in_16_bits(
         assert (copy.vectors[row] == original).all() == (label in exact)
         np.testing.assert_allclose(copy.vectors[row], original, rtol=1e-3)
     assert [path.name for path in tmp_path.iterdir()] == ["copy.npz"]
+
+
+def test_further_words_come_after_those_that_are_there() -> None:
+    more = words.read_words({"Mug": [9.0, 9.0], "wine rack": [1, 2], "Zwieback": (0.5, 0.25)})
+    found = SMALL.extended(more)
+    assert list(found.index) == ["coffee", "machine", "mug", "wine rack", "zwieback"]
+    np.testing.assert_array_equal(found.vectors[:3], SMALL.vectors)
+    np.testing.assert_array_equal(found.embed("WineRack", None), [1, 2])
+    assert len(SMALL.index) == 3
+    with pytest.raises(ValueError, match="words: vectors of 3 numbers, where the others have 2"):
+        SMALL.extended(words.read_words({"zwieback": [1, 2, 3]}))
+
+
+def test_all_words_of_a_file_are_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(words, "ASSET_WORDS", 1)
+    path = tmp_path / "glove.6B.4d.txt"
+    vectors = write_glove(path, ["the", "qwertz", "zwieback"])
+    found = words.read_words(path)
+    assert list(found.index) == ["the", "qwertz", "zwieback"]
+    np.testing.assert_array_equal(found.vectors, vectors)
+    found.save_copy(tmp_path / "copy.npz", ["zwieback", "qwertz"])
+    assert {"the", "qwertz", "zwieback"} == {*words.read_words(tmp_path / "copy.npz").index}
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({}, "no words"),
+        ({"mug": "a"}, "word 'mug': not a vector of finite numbers"),
+        ({"mug": [1, float("nan")]}, "word 'mug': not a vector of finite numbers"),
+        ({"mug": [[1, 2]]}, "word 'mug': not a vector of finite numbers"),
+        ({"mug": []}, "word 'mug': not a vector of finite numbers"),
+        ({"??": [1, 2]}, r"word '\?\?': is no word"),
+        ({"coffee mug": [1], "CoffeeMug": [2]}, "word 'CoffeeMug': is there twice"),
+        ({"mug": [1], "cup": [1, 2]}, "word 'cup': its vector is not as long as the others"),
+    ],
+)
+def test_what_is_no_vector_of_a_word_is_refused(more: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        words.read_words(more)

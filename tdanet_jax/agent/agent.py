@@ -8,7 +8,7 @@ state, decision = agent.act(state, [Detection("mug", 0.2, 0.3, 0.25, 0.4)], targ
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ from tdanet_jax.models.factory import make_model
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.sensors import suite
 from tdanet_jax.sensors.detections import centre_and_area, merge_classes
-from tdanet_jax.sensors.sensor import Frame, Motion, Start
+from tdanet_jax.sensors.sensor import NO_SLIP, Frame, MeasuredPose, Motion, Start
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import newest
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action, class_words
@@ -52,7 +52,7 @@ class Decision(NamedTuple):
     """What the agent does, and why."""
 
     action: Action
-    probabilities: np.ndarray  # [6], in the order of `Action`
+    probabilities: np.ndarray  # [6], in the order of `Action`; 0 for what is forbidden
     value: float  # expected discounted return
     attention: np.ndarray | None  # [n], weight of each detection; None if the model has none
 
@@ -85,12 +85,14 @@ class Agent:
         self.spec = dataclasses.replace(self.model.spec, grid=grid)
         self.weights = weights
         self._vectors = vectors
+        self._synonyms = synonyms
         self.labels = Labels(self.classes.names, vectors.index, synonyms)
         self._rows = {class_words(name): i for i, name in enumerate(self.classes.names)}
         self._table: Any = None
         self._decide = jax.jit(self._forward)
+        self._decide_many = jax.jit(jax.vmap(self._forward, (None, None, 0, 0, 0, 0)))
 
-    def start(self, rotation: float = 0, horizon: float = 0) -> AgentState:
+    def start(self, rotation: float = 0, horizon: float = 0, measured: bool = False) -> AgentState:
         """The state at the start of an episode.
 
         Args:
@@ -98,12 +100,13 @@ class Agent:
             lie along the grid on which the agent moves. Only networks with sensors (`--odometry`)
             need it.
           horizon: degrees down, among the grid's (in iTHOR 0 and 30); likewise.
+          measured: whether `act` will be told the `pose`.
 
         Raises:
           ValueError: the grid has no such rotation or horizon.
         """
         turn, down = self.grid.nearest_view(rotation, horizon)
-        start = Start(jnp.int32(turn), jnp.int32(down))
+        start = Start(jnp.int32(turn), jnp.int32(down), NO_SLIP if measured else None)
         return AgentState(
             recurrent=actor_critic.initial_state(self.model, self.weights, 1),
             action=jnp.int32(NUM_ACTIONS),
@@ -118,13 +121,16 @@ class Agent:
         target: str,
         key: jax.Array | None = None,
         blocked: bool | None = None,
+        *,
+        forbidden: Collection[Action] = (),
+        pose: MeasuredPose | None = None,
     ) -> tuple[AgentState, Decision]:
         """One step.
 
         The returned state assumes that the decision is carried out (otherwise replace its
         `action`), and that MoveAhead leads to the next point of the grid: one cell along one axis,
-        or along both on a diagonal (`PoseGrid.steps`). With `--triangulation` the camera's field of
-        view must be 90 degrees in both directions.
+        or along both on a diagonal (`PoseGrid.steps`). The boxes must be those of a camera with a
+        field of view of 90 degrees in both directions; `Camera` maps those of others.
 
         Args:
           state: from `start` or the previous step.
@@ -135,31 +141,99 @@ class Agent:
           blocked: whether the previous action failed to move the agent (AI2-THOR's
             `lastActionSuccess` was False). Networks with sensors need it after a MoveAhead, and
             after no other action.
+          forbidden: actions that are not taken; the others' probabilities are renormalised.
+          pose: where the agent stands, in an episode that began with `start(measured=True)`.
 
         Raises:
           LabelError: a label means nothing known, and has a word without a word vector.
-          ValueError: the model needs an image instead of detections; or it has sensors and is not
-            told whether its MoveAhead was blocked.
+          ValueError: the model needs an image instead of detections; it has sensors and is not
+            told whether its MoveAhead was blocked; every action is forbidden; or a pose is given
+            where none is expected, or missing.
         """
+        self._check(state, blocked, pose, forbidden)
+        obs, owner = self._observe(detections, target)
+        state, out, attention = self._decide(
+            self.weights, self._prepared(), state, obs, jnp.asarray(bool(blocked)), pose
+        )
+        return _decision(state, out, attention, owner, key, forbidden)
+
+    def act_many(
+        self,
+        states: Sequence[AgentState],
+        frames: Sequence[Sequence[Detection]],
+        targets: Sequence[str],
+        keys: Sequence[jax.Array | None] | None = None,
+        blocked: Sequence[bool | None] | None = None,
+        *,
+        forbidden: Collection[Action] = (),
+        poses: Sequence[MeasuredPose] | None = None,
+    ) -> list[tuple[AgentState, Decision]]:
+        """`act` for N robots at once, in one compiled program for each N.
+
+        Args:
+          states, frames, targets, keys, blocked, poses: N arguments of `act`, one for each robot.
+          forbidden: actions that none of them takes.
+
+        Returns:
+          What `act` gives for each robot.
+
+        Raises:
+          LabelError, ValueError: as `act`; or the arguments are not equally many.
+        """
+        count = len(states)
+        told: Sequence[bool | None] = blocked or [None] * count
+        where: Sequence[MeasuredPose | None] = poses or [None] * count
+        if {*map(len, (frames, targets, told, where, keys or states))} != {count}:
+            raise ValueError(
+                f"{count} states: give as many frames, targets, keys, blocked and poses"
+            )
+        if len({pose is None for pose in where}) > 1:
+            raise ValueError("poses: give one for each robot, or none")
+        for one in zip(states, told, where, strict=True):
+            self._check(*one, forbidden)
+        if not count:
+            return []
+        rows = max(map(len, frames))
+        observed = [self._observe(*one, rows) for one in zip(frames, targets, strict=True)]
+        state, obs, pose = (
+            jax.tree.map(lambda *leaves: np.stack(leaves), *jax.device_get(parts))
+            for parts in ([*states], [obs for obs, _ in observed], [*where])
+        )
+        out = jax.device_get(
+            self._decide_many(
+                self.weights, self._prepared(), state, obs, np.array(told, bool), pose
+            )
+        )
+        decided = []
+        for i, (_, owner) in enumerate(observed):
+            own, values, attention = jax.tree.map(lambda leaf, i=i: leaf[i], out)
+            key = None if keys is None else keys[i]
+            decided.append(_decision(own, values, attention, owner, key, forbidden))
+        return decided
+
+    def _check(
+        self,
+        state: AgentState,
+        blocked: bool | None,
+        pose: MeasuredPose | None,
+        forbidden: Collection[Action],
+    ) -> None:
+        """Raises ValueError if the arguments of `act` do not go together."""
         if self.model.encoder.IMAGE:
             raise ValueError(
                 f"{self.config.model} needs an image; an agent is shown detections alone"
             )
         if self.spec.sensors and blocked is None and state.action == Action.MOVE_AHEAD:
             raise ValueError("the agent has odometry: say whether its MoveAhead was `blocked`")
-        obs, owner = self._observe(detections, target)
-        state, out, attention = self._decide(
-            self.weights, self._prepared(), state, obs, jnp.asarray(bool(blocked))
-        )
-        logits, value = out
-        best = jnp.argmax(logits, -1) if key is None else jax.random.categorical(key, logits)
-        decision = Decision(
-            action=Action(int(best[0])),
-            probabilities=np.asarray(state.recurrent.prev_action_probs[0]),
-            value=float(value[0]),
-            attention=None if attention is None else np.asarray(attention[0])[owner],
-        )
-        return state._replace(action=best[0]), decision
+        if len({*forbidden}) >= NUM_ACTIONS:
+            raise ValueError("every action is forbidden")
+        if "odometry" in state.sensors:
+            expected = state.sensors["odometry"].deviation is not None
+            if expected != (pose is not None):
+                raise ValueError(
+                    "a pose is measured in every step of an episode that begins with "
+                    "start(measured=True), and in no other"
+                )
 
     def knows(self, label: str) -> bool:
         """Whether a label has a meaning (`labels`), so that it can be detected or looked for."""
@@ -169,12 +243,35 @@ class Agent:
             return False
         return True
 
+    def add_words(self, more: Mapping[str, Sequence[float]] | Path | str) -> int:
+        """Gives the agent further words, for labels that it does not know.
+
+        Args:
+          more: word -> vector, or a file of vectors as GloVe's (`words.load_word_vectors`), of
+            which all words are taken. They must be vectors of the same model and length as those
+            with which the agent was trained (by default glove.6B.50d): others tell it nothing.
+
+        Returns:
+          The number of words that are new. Words that the agent has keep their vectors.
+
+        Raises:
+          ValueError: the file cannot be read, something is not a vector, or vectors are of another
+            length; the agent stays as it was.
+        """
+        source = "words" if isinstance(more, Mapping) else more
+        vectors = self._vectors.extended(words.read_words(more), source)
+        added = len(vectors.index) - len(self._vectors.index)
+        labels = Labels(self.classes.names, vectors.index, self._synonyms)
+        self._vectors, self.labels, self._table = vectors, labels, None
+        return added
+
     def _observe(
-        self, detections: Sequence[Detection], target: str
+        self, detections: Sequence[Detection], target: str, least_rows: int = 0
     ) -> tuple[Observation, np.ndarray]:
         """The frame as the network sees it, and the row of each detection.
 
-        A row per detection; for a model made for it, a row per class.
+        A row per detection; for a model made for it, a row per class. The rest, up to `least_rows`
+        at least, is padding.
         """
         labels = np.array([self._index(d.label) for d in detections], np.int32)
         corners = np.array([(d.x1, d.y1, d.x2, d.y2) for d in detections]).reshape(-1, 4)
@@ -185,7 +282,7 @@ class Agent:
         else:
             owner, found = np.arange(len(labels)), centre_and_area(corners)
         count = len(labels)
-        rows = max(-(-count // ROW_BLOCK), 1) * ROW_BLOCK
+        rows = max(-(-max(count, least_rows) // ROW_BLOCK), 1) * ROW_BLOCK
         classes, boxes = np.zeros((1, rows), np.int32), np.zeros((1, rows, 3), np.float32)
         classes[0, :count], boxes[0, :count] = labels, found
         observation = Observation(
@@ -221,11 +318,12 @@ class Agent:
         state: AgentState,
         obs: Observation,
         blocked: jax.Array,
+        pose: MeasuredPose | None,
     ) -> tuple[AgentState, Output, jax.Array | None]:
         """The state but for the next action, policy and value, and the attention."""
         spec = self.spec
         frame = Frame(obs.classes[0], obs.boxes[0], obs.mask[0], obs.target[0])
-        sensors = suite.update(spec, state.sensors, Motion(state.action, blocked))
+        sensors = suite.update(spec, state.sensors, Motion(state.action, blocked, measured=pose))
         sensors = suite.clear(spec, sensors, state.target != frame.target)
         sensors = suite.observe(spec, sensors, frame)
         readings = jax.tree.map(lambda x: x[None], suite.read(spec, sensors))
@@ -235,6 +333,29 @@ class Agent:
         )  # fmt: skip
         (attention,) = kept["intermediates"]["attention"]
         return AgentState(recurrent, state.action, sensors, frame.target), out, attention
+
+
+def _decision(
+    state: AgentState,
+    out: Output,
+    attention: jax.Array | None,
+    owner: np.ndarray,
+    key: jax.Array | None,
+    forbidden: Collection[Action],
+) -> tuple[AgentState, Decision]:
+    """The state after a step, and the decision, from what `Agent._forward` gives."""
+    logits, probabilities = jnp.asarray(out.logits[0]), state.recurrent.prev_action_probs[0]
+    if forbidden:
+        logits = logits.at[np.array([*forbidden])].set(-jnp.inf)
+        probabilities = jax.nn.softmax(logits)
+    action = jnp.argmax(logits) if key is None else jax.random.categorical(key, logits)
+    decision = Decision(
+        action=Action(int(action)),
+        probabilities=np.asarray(probabilities),
+        value=float(out.value[0]),
+        attention=None if attention is None else np.asarray(attention[0])[owner],
+    )
+    return state._replace(action=action.astype(jnp.int32)), decision
 
 
 def load(

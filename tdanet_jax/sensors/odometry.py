@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from tdanet_jax.poses import ITHOR, STEPS, PoseGrid, modulo
-from tdanet_jax.sensors.sensor import Motion, Sensor, Start
+from tdanet_jax.poses import ITHOR, STEPS, Integers, PoseGrid, modulo
+from tdanet_jax.sensors.sensor import MeasuredPose, Motion, Sensor, Start
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action
 
 #: Cells of the grid along each side of the map, which wraps around like a torus. The largest iTHOR
@@ -52,7 +52,7 @@ def _window_offsets(rotations: int) -> np.ndarray:
 
 
 class Deviation(struct.PyTreeNode):
-    """How far the pose that an agent believes in is off the grid, if its motion slips."""
+    """How far the pose that an agent believes in is off the grid: motion slips or is measured."""
 
     place: jax.Array  # [2] float32, from the cell to where it believes to stand; x and z in cells
     angle: jax.Array  # float32, radians clockwise from its heading to that which it believes in
@@ -74,7 +74,7 @@ class OdometryState(struct.PyTreeNode):
     action: jax.Array  # int32, the last action; 6 before the first
     blocked: jax.Array  # bool, the last action was a MoveAhead that did not move the agent
     cells: jax.Array  # [MAP_SIZE, MAP_SIZE] uint16, the bits of each cell
-    deviation: Deviation | None = None  # None without noise
+    deviation: Deviation | None = None  # None if all motion is as the agent believes
 
 
 class OdometryReading(struct.PyTreeNode):
@@ -94,7 +94,7 @@ class Odometry(Sensor):
 
     def init(self, start: Start) -> OdometryState:
         """At the origin; of the rotation, only how it lies to the axes of the grid matters."""
-        heading = modulo(start.rotation, math.lcm(self.grid.turn, 90) // self.grid.turn)
+        heading = _first_heading(self.grid, start.rotation)
         cells = jnp.zeros((MAP_SIZE, MAP_SIZE), jnp.uint16)
         return OdometryState(
             cell=jnp.zeros(2, jnp.int32),
@@ -124,11 +124,14 @@ class Odometry(Sensor):
             action=motion.action.astype(jnp.int32),
             blocked=blocked,
             cells=state.cells,
-            deviation=_deviation(self.grid, state, motion),
+            deviation=None,
         )
+        after = after.replace(deviation=_deviation(self.grid, state, motion, after))
         stands, faces = nearest(self.grid, after)
         # One cell changes: the one in the way, or the one where the agent stands.
-        in_the_way = ahead if motion.slip is None else stands + jnp.asarray(self.grid.steps)[faces]
+        in_the_way = (
+            ahead if after.deviation is None else stands + jnp.asarray(self.grid.steps)[faces]
+        )
         changed = jnp.where(blocked, in_the_way, stands) & (MAP_SIZE - 1)
         bit = jnp.where(blocked, BLOCKED, 1 << self.grid.neighbour(faces)).astype(jnp.uint16)
         at = changed[0], changed[1]
@@ -167,6 +170,29 @@ def make() -> Odometry:
     return Odometry()
 
 
+def measured_pose(
+    grid: PoseGrid, rotation: int, ahead: float, right: float, turned: float
+) -> MeasuredPose:
+    """A pose that was measured relative to an episode's start, in the axes of odometry.
+
+    Args:
+      grid: the agent's.
+      rotation: at the start, in turns, as in `Start`.
+      ahead: metres from the start, in the direction in which the agent faced there.
+      right: metres to the right of it.
+      turned: degrees clockwise from that direction.
+    """
+    angle = math.radians(grid.turn * _first_heading(grid, rotation))
+    sine, cosine = math.sin(angle), math.cos(angle)
+    x, z = ahead * sine + right * cosine, ahead * cosine - right * sine
+    place = jnp.array([x / grid.grid_size, z / grid.grid_size], jnp.float32)
+    return MeasuredPose(place, jnp.float32(angle + math.radians(turned)))
+
+
+def _first_heading(grid: PoseGrid, rotation: Integers) -> Integers:
+    return modulo(rotation, math.lcm(grid.turn, 90) // grid.turn)
+
+
 def turn(
     grid: PoseGrid, heading: jax.Array, horizon: jax.Array, action: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -190,9 +216,18 @@ def tilt(grid: PoseGrid, horizon: jax.Array) -> jax.Array:
     return jnp.asarray(np.array(grid.horizons) / 30, jnp.float32)[horizon]
 
 
-def _deviation(grid: PoseGrid, state: OdometryState, motion: Motion) -> Deviation | None:
+def _deviation(
+    grid: PoseGrid, state: OdometryState, motion: Motion, after: OdometryState
+) -> Deviation | None:
     """How far the believed pose is off the grid after an action."""
-    before, slip = state.deviation, motion.slip
+    before, slip, measured = state.deviation, motion.slip, motion.measured
+    if before is not None and measured is not None:
+        return Deviation(
+            place=measured.place - after.cell,
+            angle=measured.angle - after.heading * (2 * jnp.pi / grid.rotations),
+            error=jnp.zeros_like(before.error),
+            step=measured.place - (state.cell + before.place),
+        )
     if before is None or slip is None:
         return None
     ahead = motion.action == Action.MOVE_AHEAD

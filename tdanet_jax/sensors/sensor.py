@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import jax
+import numpy as np
 
 from tdanet_jax.poses import ITHOR, PoseGrid
 
@@ -24,6 +25,17 @@ class Slip(NamedTuple):
     turn: jax.Array  # float32, believed angle of a turn, as a share of it
     drift: jax.Array  # float32, radians by which the believed heading turns before a MoveAhead
     error: jax.Array  # float32, radians by which the heading is wrong in this pose alone
+
+
+#: What the `slip` of a `Start` is where motion is measured, not believed.
+NO_SLIP = Slip(*np.array([1, 1, 0, 0], np.float32))
+
+
+class MeasuredPose(NamedTuple):
+    """Where an agent stands and faces, measured on a robot; see `odometry.measured_pose`."""
+
+    place: jax.Array  # [2] float32, x and z in cells, in the axes of `odometry.OdometryState`
+    angle: jax.Array  # float32, radians clockwise from z
 
 
 class Start(NamedTuple):
@@ -40,6 +52,7 @@ class Motion(NamedTuple):
     action: jax.Array  # int32; 6 before the first action, which changes nothing
     blocked: jax.Array  # bool, the agent did not move; only meaningful after a MoveAhead
     slip: Slip | None = None  # as in `Start`: None in all of an episode, or never
+    measured: MeasuredPose | None = None  # where it led, in place of `slip`
 
 
 class Frame(NamedTuple):

@@ -24,9 +24,10 @@ from tdanet_jax.env.reward import find_parents
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.classes import ClassVocabulary, make_vocabulary
 from tdanet_jax.models.factory import make_model
-from tdanet_jax.poses import PoseGrid
+from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.scenes import dataset, tabulation
 from tdanet_jax.scenes.dataset import Extras, Rooms
+from tdanet_jax.sensors import odometry
 from tdanet_jax.sensors.triangulation import no_estimate
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
@@ -398,6 +399,133 @@ def test_a_key_samples_and_the_same_key_samples_the_same(agent):
     again = [agent.act(agent.start(), seen, "mug", key)[1].action for key in keys]
     assert actions == again
     assert len(set(actions)) > 1
+
+
+def test_what_is_forbidden_is_never_done(agent):
+    seen = [Detection("mug", 0.1, 0.1, 0.3, 0.4)]
+    _, free = agent.act(agent.start(), seen, "mug")
+    tilts = (Action.LOOK_UP, Action.LOOK_DOWN)
+    state, decision = agent.act(agent.start(), seen, "mug", forbidden=tilts)
+    kept = [action for action in Action if action not in tilts]
+    assert not decision.probabilities[[*tilts]].any()
+    share = free.probabilities[kept] / free.probabilities[kept].sum()
+    np.testing.assert_allclose(decision.probabilities[kept], share, rtol=1e-5)
+    # The network remembers what it would have done, as in training.
+    np.testing.assert_array_equal(state.recurrent.prev_action_probs[0], free.probabilities)
+    others = [action for action in Action if action != free.action]
+    assert agent.act(agent.start(), seen, "mug", forbidden=others)[1].action == free.action
+    best = agent.act(agent.start(), seen, "mug", forbidden=[free.action])[1]
+    assert best.action != free.action
+    sampled = {
+        agent.act(agent.start(), seen, "mug", key, forbidden=others[1:])[1].action
+        for key in jax.random.split(jax.random.key(0), 20)
+    }
+    assert sampled == {free.action, others[0]}
+    with pytest.raises(ValueError, match="every action is forbidden"):
+        agent.act(agent.start(), seen, "mug", forbidden=Action)
+
+
+def several(agent, steps, together):
+    """What three robots decide in some steps, by `act_many` or one after the other."""
+    boxes = [Detection(name, 0.1, 0.1, 0.3, 0.4) for name in ("sink", "mug", "plate")]
+    targets = ["mug", "sink", "toaster"]
+    states = [agent.start(rotation) for rotation in (0, 45, 90)]
+    shown = []
+    for step in range(steps):
+        frames = [boxes[: (step + i) % 4] * (1 + 8 * i * step) for i in range(3)]
+        keys = [*jax.random.split(jax.random.key(step), 2), None]
+        told = [False, step % 2 == 1, False]
+        if together:
+            done = agent.act_many(states, frames, targets, keys, told, forbidden=[5])
+        else:
+            every = zip(states, frames, targets, keys, told, strict=True)
+            done = [agent.act(*one, forbidden=[Action.DONE]) for one in every]
+        states = [state for state, _ in done]
+        shown += [decision for _, decision in done]
+    return states, shown
+
+
+@pytest.mark.parametrize("who", ["agent", "triangulating_agent"])
+def test_robots_together_decide_as_each_on_its_own(who, request):
+    chosen = request.getfixturevalue(who)
+    (one, alone), (other, together) = several(chosen, 3, False), several(chosen, 3, True)
+    chex.assert_trees_all_close(
+        [s.recurrent for s in one], [s.recurrent for s in other], rtol=1e-4, atol=1e-5
+    )
+    for a, b in zip(alone, together, strict=True):
+        assert a.action == b.action
+        np.testing.assert_allclose(a.probabilities, b.probabilities, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(a.attention, b.attention, rtol=1e-4, atol=1e-6)
+    assert chosen._decide_many._cache_size() <= 3  # one for each number of rows
+
+
+def test_robots_together_are_told_equally_much(odometry_agent):
+    states = [odometry_agent.start(), odometry_agent.start(measured=True)]
+    assert odometry_agent.act_many([], [], []) == []
+    with pytest.raises(ValueError, match="2 states: give as many frames, targets, keys, blocked"):
+        odometry_agent.act_many(states, [[]], ["mug", "mug"])
+    pose = odometry.measured_pose(ITHOR, 0, 0, 0, 0)
+    with pytest.raises(ValueError, match="poses: give one for each robot, or none"):
+        odometry_agent.act_many(states, [[], []], ["mug", "mug"], poses=[None, pose])
+
+
+def test_measured_poses_are_believed(triangulating_agent):
+    """Where motion goes as planned they change nothing; else the map and estimate follow them."""
+    mug, sink = Detection("mug", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.6, 0.1, 0.8, 0.4)
+
+    def second(ahead, turned, blocked=False):
+        state, _ = triangulating_agent.act(
+            triangulating_agent.start(measured=True), [mug, sink], "mug", pose=pose(0, 0)
+        )
+        state = state._replace(action=jnp.int32(Action.MOVE_AHEAD))
+        return triangulating_agent.act(
+            state, [sink], "mug", blocked=blocked, pose=pose(ahead, turned)
+        )
+
+    def pose(ahead, turned):
+        return odometry.measured_pose(ITHOR, 0, ahead, 0.0, turned)
+
+    state, _ = triangulating_agent.act(triangulating_agent.start(), [mug, sink], "mug")
+    state = state._replace(action=jnp.int32(Action.MOVE_AHEAD))
+    _, plain = triangulating_agent.act(state, [sink], "mug", blocked=False)
+    after, decision = second(0.25, 0)
+    np.testing.assert_allclose(decision.probabilities, plain.probabilities, rtol=1e-4)
+    for ahead, turned in ((0.1, 0), (0.25, 10)):
+        other = second(ahead, turned)[1].probabilities
+        assert np.abs(other - plain.probabilities).max() > 1e-4
+    (both,) = triangulating_agent.act_many(
+        [after], [[sink]], ["mug"], blocked=[False], poses=[pose(0.4, 0)]
+    )
+    alone = triangulating_agent.act(after, [sink], "mug", blocked=False, pose=pose(0.4, 0))
+    np.testing.assert_allclose(both[1].probabilities, alone[1].probabilities, rtol=1e-4)
+    for begun, given in ((after, None), (state, pose(0, 0))):
+        with pytest.raises(ValueError, match="a pose is measured in every step of an episode"):
+            triangulating_agent.act(begun, [], "mug", blocked=False, pose=given)
+
+
+def test_an_agent_is_given_more_words(weights, glove, tmp_path):
+    agent = Agent(CONFIG, weights, glove, synonyms={"Mug": ["Humpen"]})
+    mug = Detection("mug", 0.1, 0.1, 0.3, 0.4)
+    _, before = agent.act(agent.start(), [mug], "mug")
+    with pytest.raises(KeyError, match=r"no word vector for qwertzu.*agent\.add_words adds words"):
+        agent.act(agent.start(), [], "qwertzu")
+    sink = glove.embed("sink", None)
+    assert agent.add_words({"Qwertzu": 2 * sink, "mug": -sink}) == 1
+    _, after = agent.act(agent.start(), [mug], "humpen")
+    np.testing.assert_array_equal(before.probabilities, after.probabilities)
+    _, one = agent.act(agent.start(), [mug, Detection("qwertzus", 0.5, 0.5, 0.9, 0.9)], "qwertzu")
+    _, other = agent.act(agent.start(), [mug, Detection("sink", 0.5, 0.5, 0.9, 0.9)], "sink")
+    np.testing.assert_allclose(one.probabilities, other.probabilities, rtol=1e-4)
+    path = tmp_path / "more.txt"
+    path.write_text("zwiebacky 1 2 3\n")
+    with pytest.raises(
+        ValueError, match=r"more\.txt: vectors of 3 numbers, where the others have 50"
+    ):
+        agent.add_words(path)
+    assert not agent.knows("zwiebacky")
+    path.write_text(f"zwiebacky {' '.join(map(str, sink))}\n")
+    assert agent.add_words(path) == 1
+    assert agent.knows("zwiebacky")
 
 
 def test_what_an_agent_knows(weights, glove):

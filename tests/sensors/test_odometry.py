@@ -23,9 +23,9 @@ from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.scenes.tabulation import build
-from tdanet_jax.sensors import suite
-from tdanet_jax.sensors.odometry import Odometry, OdometryReading, OdometryState
-from tdanet_jax.sensors.sensor import Motion, Start
+from tdanet_jax.sensors import odometry, suite
+from tdanet_jax.sensors.odometry import Odometry, OdometryReading, OdometryState, measured_pose
+from tdanet_jax.sensors.sensor import NO_SLIP, Motion, Start
 from tests.support import toy
 from tests.support.oracle import (
     DONE,
@@ -507,3 +507,76 @@ def test_choosing_episodes_chooses_their_maps() -> None:
     for b in range(8):
         one, new, old = (jax.tree.map(lambda x, b=b: x[b], s) for s in (found, *states))
         chex.assert_trees_all_equal(one, new if chosen[b] else old)
+
+
+# Measured poses.
+
+
+measured_walk = st.lists(st.tuples(st.integers(0, 4), st.booleans()), min_size=1, max_size=12)
+
+
+def relative(place: tuple[float, float], heading: float, rotation: float) -> tuple[float, ...]:
+    """A pose in metres and degrees as it is measured from the start."""
+    angle = math.radians(rotation)
+    (x, z) = place
+    right, ahead = (
+        x * math.cos(angle) - z * math.sin(angle),
+        x * math.sin(angle) + z * math.cos(angle),
+    )
+    return ahead, right, heading - rotation
+
+
+update, read, last_step = (
+    jax.jit(SENSOR.update),
+    jax.jit(SENSOR.read),
+    jax.jit(functools.partial(odometry.last_step, ITHOR)),
+)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 7), measured_walk)
+def test_where_motion_goes_as_believed_measuring_it_changes_nothing(
+    rotation: int, walk: list[tuple[int, bool]]
+) -> None:
+    plain = SENSOR.init(Start(jnp.int32(rotation), jnp.int32(0)))
+    state = SENSOR.init(Start(jnp.int32(rotation), jnp.int32(0), NO_SLIP))
+    first = int(plain.heading) * 45
+    for action, blocked in walk:
+        motion = Motion(jnp.int32(action), jnp.array(blocked))
+        plain = update(plain, motion, {})
+        place = tuple(0.25 * np.asarray(plain.cell, float))
+        told = relative(place, 45 * int(plain.heading), first)
+        pose = measured_pose(ITHOR, rotation, *told)
+        state = update(state, motion._replace(measured=pose), {})
+        known, expected = read(state, {}), read(plain, {})
+        np.testing.assert_array_equal(known.window, expected.window)
+        np.testing.assert_allclose(known.motion, expected.motion, atol=1e-5)
+        np.testing.assert_allclose(last_step(state), last_step(plain), atol=1e-5)
+
+
+@settings(max_examples=30)
+@given(
+    st.integers(0, 7),
+    st.lists(st.tuples(*[st.floats(-1, 1)] * 2, st.floats(-180, 180)), min_size=1, max_size=5),
+)
+def test_a_measured_pose_is_believed_whatever_the_action(
+    rotation: int, poses: list[tuple[float, float, float]]
+) -> None:
+    state = SENSOR.init(Start(jnp.int32(rotation), jnp.int32(0), NO_SLIP))
+    angle = np.radians(45 * (rotation % 2))
+    before = np.zeros(2)
+    for ahead, right, turned in poses:
+        pose = measured_pose(ITHOR, rotation, ahead, right, turned)
+        state = update(state, Motion(jnp.int32(MOVE_AHEAD), jnp.array(False), measured=pose), {})
+        place = np.array([ahead * np.sin(angle) + right * np.cos(angle),
+                          ahead * np.cos(angle) - right * np.sin(angle)])  # fmt: skip
+        faces = angle + np.radians(turned)
+        motion = np.asarray(read(state, {}).motion)
+        np.testing.assert_allclose(motion[2:4], [np.sin(faces), np.cos(faces)], atol=1e-5)
+        beside = place[0] * np.cos(faces) - place[1] * np.sin(faces)
+        assert motion[0] == pytest.approx(beside / 4, abs=1e-5)
+        np.testing.assert_allclose(last_step(state), (place - before) / 0.25, atol=1e-4)
+        cell = np.rint(place / 0.25).astype(int) % 64
+        direction = round(float(np.degrees(faces)) / 45) % 8
+        assert int(state.cells[*cell]) >> direction & 1
+        before = place
