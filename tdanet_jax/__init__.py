@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Any
 from tdanet_jax import _moved
 
 if TYPE_CHECKING:
-    from tdanet_jax.agent import Agent, Camera, Decision, Detection, load
+    from tdanet_jax.agent import (
+        Agent,
+        Camera,
+        Decision,
+        Detection,
+        Navigator,
+        NavigatorConfig,
+        load,
+    )
     from tdanet_jax.config import EvalConfig, LearnerConfig, NetworkConfig, TrainConfig
     from tdanet_jax.task import make
     from tdanet_jax.training.callbacks import Callbacks
@@ -30,6 +38,8 @@ _PUBLIC = {
     "Detection": "agent",
     "EvalConfig": "config",
     "LearnerConfig": "config",
+    "Navigator": "agent",
+    "NavigatorConfig": "agent",
     "NetworkConfig": "config",
     "TrainConfig": "config",
     "evaluate": "workflows.evaluate",
@@ -46,6 +56,8 @@ __all__ = [
     "Detection",
     "EvalConfig",
     "LearnerConfig",
+    "Navigator",
+    "NavigatorConfig",
     "NetworkConfig",
     "TrainConfig",
     "__version__",

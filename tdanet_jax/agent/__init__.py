@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from tdanet_jax.agent.agent import Agent, AgentState, Decision, load
     from tdanet_jax.agent.camera import Camera
     from tdanet_jax.agent.detection import Detection
+    from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
 
 #: Public names, and the module that each is in.
 _MODULES = {
@@ -20,10 +21,21 @@ _MODULES = {
     "Camera": "camera",
     "Decision": "agent",
     "Detection": "detection",
+    "Navigator": "navigator",
+    "NavigatorConfig": "navigator",
     "load": "agent",
 }
 
-__all__ = ["Agent", "AgentState", "Camera", "Decision", "Detection", "load"]
+__all__ = [
+    "Agent",
+    "AgentState",
+    "Camera",
+    "Decision",
+    "Detection",
+    "Navigator",
+    "NavigatorConfig",
+    "load",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -171,8 +171,13 @@ class Agent:
         """`act` for N robots at once, in one compiled program for each N.
 
         Args:
-          states, frames, targets, keys, blocked, poses: N arguments of `act`, one for each robot.
+          states: of each robot, from `start`, `act` or this.
+          frames: the detections of each.
+          targets: what each looks for.
+          keys: as in `act`, of each; None takes the most probable actions.
+          blocked: as in `act`, of each.
           forbidden: actions that none of them takes.
+          poses: as in `act`, of each or of none.
 
         Returns:
           What `act` gives for each robot.
