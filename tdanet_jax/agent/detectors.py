@@ -76,7 +76,7 @@ def from_ultralytics(results: Any, names: Names | None = None) -> list[Detection
     height, width = results.orig_shape
     labels = [_label("ultralytics", c, names or results.names) for c in found.cls.tolist()]
     rows = zip(labels, found.xyxy.tolist(), found.conf.tolist(), strict=True)
-    return _detections(rows, width, height)
+    return in_image(rows, width, height)
 
 
 def from_supervision(
@@ -101,7 +101,7 @@ def from_supervision(
     labels = [_label("supervision", cls, names) for cls in classes.tolist()]
     scores = detections.confidence
     listed = [None] * len(boxes) if scores is None else scores.tolist()
-    return _detections(zip(labels, boxes, listed, strict=True), width, height)
+    return in_image(zip(labels, boxes, listed, strict=True), width, height)
 
 
 def from_torchvision(
@@ -121,7 +121,7 @@ def from_torchvision(
     boxes = output["boxes"].tolist()
     labels = [_label("torchvision", cls, names) for cls in output["labels"].tolist()]
     scores = output["scores"].tolist() if "scores" in output else [None] * len(boxes)
-    return _detections(zip(labels, boxes, scores, strict=True), width, height)
+    return in_image(zip(labels, boxes, scores, strict=True), width, height)
 
 
 def from_depthai(message: Any, names: Names | None = None) -> list[Detection]:
@@ -139,7 +139,7 @@ def from_depthai(message: Any, names: Names | None = None) -> list[Detection]:
         named = getattr(found, "labelName", "") if names is None else ""
         label = named or _label("depthai", found.label, names)
         rows.append((label, (found.xmin, found.ymin, found.xmax, found.ymax), found.confidence))
-    return _detections(rows)
+    return in_image(rows)
 
 
 def from_vision_msgs(message: Any, image_size: Any, names: Names | None = None) -> list[Detection]:
@@ -167,7 +167,7 @@ def from_vision_msgs(message: Any, image_size: Any, names: Names | None = None) 
         cls = best.class_id if hasattr(best, "class_id") else best.id
         label = _label("vision_msgs", cls, names)
         rows.append((label, _upright(found.bbox), best.score or None))
-    return _detections(rows, width, height)
+    return in_image(rows, width, height)
 
 
 def _upright(bbox: Any) -> tuple[float, ...]:
@@ -180,12 +180,21 @@ def _upright(bbox: Any) -> tuple[float, ...]:
     return centre.x - wide, centre.y - high, centre.x + wide, centre.y + high
 
 
-def _detections(
+def in_image(
     rows: Iterable[tuple[str, Sequence[float], float | None]],
     width: float = 1.0,
     height: float = 1.0,
 ) -> list[Detection]:
-    """Detections from labels, corners and scores, without those that are outside of the image."""
+    """Detections from labels, boxes and scores, clipped, without those outside of the image.
+
+    Args:
+      rows: a label, the corners x1, y1, x2, y2, and a score or None.
+      width: of the image, in the unit of the corners; by default they are shares.
+      height: likewise.
+
+    Raises:
+      ValueError: a box is none, or a score is not from 0 to 1.
+    """
     out = []
     for label, (left, top, right, bottom), score in rows:
         x1, y1, x2, y2 = left / width, top / height, right / width, bottom / height

@@ -98,6 +98,8 @@ class Navigator:
         self._forbidden = tuple(Action(ACTION_NAMES.index(name)) for name in config.forbid)
         self._unknown: set[str] = set()
         self._drawn = 0
+        self._look = agent.grid.level  # index of the horizon that the agent believes in
+        self._off = self.camera.horizon  # degrees that the camera looks further down than that
 
     @property
     def finished(self) -> bool:
@@ -111,25 +113,26 @@ class Navigator:
           target: what to look for, in English.
           rotation: how the robot faces, in degrees clockwise: 0 unless its steps are to lie on a
             known grid; a multiple of the turns of the agent's grid.
-          horizon: degrees that the agent takes its camera to look down, among its grid's (0 and
-            30); by default the one nearest to the camera's.
+          horizon: degrees that the camera looks down now; by default as it did after the last
+            action, or at first as `camera` says.
 
         Returns:
           This navigator.
 
         Raises:
           LabelError: the target means nothing known; the message says how to add a word.
-          ValueError: the agent's grid has no such rotation or horizon.
+          ValueError: the agent's grid has no such rotation, or the horizon is out of range.
         """
         grid = self.agent.grid
-        if horizon is None:
-            horizon = min(grid.horizons, key=lambda down: abs(down - self.camera.horizon))
-        turn, look = grid.nearest_view(rotation, horizon)
+        down = self._tilt if horizon is None else horizon
+        if not abs(down) < 90:
+            raise ValueError(f"horizon {down}: must be between -90 and 90 degrees")
+        nearest = min(grid.horizons, key=lambda degrees: abs(degrees - down))
+        turn, look = grid.nearest_view(rotation, nearest)
         self.agent.labels.resolve(target)
         self.target, self.steps, self.outcome = target, 0, None
         self.seen, self.decision = [], None
-        self._start = turn, look
-        self._look = look
+        self._start, self._look, self._off = turn, look, down - nearest
         self._state: AgentState | None = None
         self._origin: RobotPose | None = None
         self._before: RobotPose | None = None
@@ -157,9 +160,9 @@ class Navigator:
           degrees), LookUp, LookDown (30 degrees) or Done: the target is in view, within 1.5 m.
 
         Raises:
-          ValueError: there is no episode, or it is over; the frame cannot be read; a pose is missing
-            or not three numbers; or it is not known whether a MoveAhead was blocked. The navigator
-            stays as it was.
+          ValueError: there is no episode, or it is over; the frame cannot be read; a pose is
+            missing, or not three numbers; or it is not known whether a MoveAhead was blocked. The
+            navigator stays as it was.
         """
         if self.target is None or self.finished:
             over = "no episode has begun" if self.target is None else f"it is over: {self.outcome}"
@@ -175,8 +178,8 @@ class Navigator:
         if not moved:
             kept += self._still_there({*map(self._name, seen)}, right, look)
         state = self._state or self.agent.start(
-            self.agent.grid.turn * self._start[0],
-            self.agent.grid.horizons[self._start[1]],
+            self.agent.grid.turn * self._start,
+            self.agent.grid.horizons[look],
             measured=pose is not None,
         )
         state, decision = self.agent.act(
@@ -204,7 +207,7 @@ class Navigator:
         ahead = (pose[0] - x) * math.cos(yaw) + (pose[1] - y) * math.sin(yaw)
         left = (pose[1] - y) * math.cos(yaw) - (pose[0] - x) * math.sin(yaw)
         degrees = -math.degrees(pose[2] - yaw)
-        return odometry.measured_pose(self.agent.grid, self._start[0], ahead, -left, degrees)
+        return odometry.measured_pose(self.agent.grid, self._start, ahead, -left, degrees)
 
     def _motion(self, blocked: bool | None, pose: RobotPose | None) -> tuple[bool, float]:
         """Whether the last action moved the robot, and by how many degrees it turned it right."""
@@ -218,6 +221,11 @@ class Navigator:
     def _last(self) -> Action | None:
         return None if self.decision is None else self.decision.action
 
+    @property
+    def _tilt(self) -> float:
+        """Degrees that the camera looks down after the last action."""
+        return self.agent.grid.horizons[self._now_looking()] + self._off
+
     def _now_looking(self) -> int:
         """The index of the horizon after the last action."""
         lower = (self._last() == Action.LOOK_DOWN) - (self._last() == Action.LOOK_UP)
@@ -230,7 +238,7 @@ class Navigator:
             unlikely = found.score is not None and found.score < self.config.min_score
             if not unlikely and self._name(found) is not None:
                 known.append(found)
-        return self.camera.to_agent(known, self.agent.grid.horizons[self._start[1]])
+        return self.camera.to_agent(known, self.camera.horizon - self._off)
 
     def _name(self, found: Detection) -> str | None:
         """What a detection is; None, with one warning for each label, if that is unknown."""

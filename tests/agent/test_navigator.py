@@ -94,8 +94,25 @@ def test_boxes_are_those_of_an_agents_camera(navigator):
     level.step([MUG])
     assert level.agent.starts == [(0, 0, False)]
     given = navigator("Done", camera=Camera(60, 40, horizon=14))
-    given.reset("mug", rotation=90, horizon=30).step([MUG])
+    given.reset("mug", rotation=90, horizon=25).step([MUG])
     assert given.agent.starts == [(90, 30, False)]
+    assert given.seen == Camera(60, 40).to_agent([MUG], 5)
+
+
+def test_the_next_episode_begins_as_the_camera_looks(navigator):
+    nav = navigator(
+        "LookDown", "Done", "LookUp", "LookUp", "Done", camera=Camera(60, 40, horizon=5)
+    )
+    assert [nav.step([]), nav.step([])] == ["LookDown", "Done"]
+    nav.reset("sink").step([MUG])
+    assert nav.agent.starts == [(0, 0, False), (0, 30, False)]
+    assert nav.seen == Camera(60, 40).to_agent([MUG], -5)
+    nav.step([])
+    nav.reset("mug").step([])
+    assert nav.agent.starts[2] == (0, 0, False)
+    for horizon in (90, float("nan")):
+        with pytest.raises(ValueError, match=r"horizon .*: must be between -90 and 90 degrees"):
+            nav.reset("mug", horizon=horizon)
 
 
 def test_what_is_unlikely_or_unknown_is_ignored(navigator):

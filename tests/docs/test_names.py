@@ -17,7 +17,7 @@ from tests.support.pages import PAGES, ROOT, prose
 COMMANDS = (
     "attention", "benchmark", "evaluate", "replay", "scaling", "scenes verify", "scenes inspect",
     "scenes build", "scenes import", "scenes export", "scenes collect", "scenes vary",
-    "scenes compare", "share", "sweep", "train_zero_shot", "trajectories",
+    "scenes compare", "serve", "share", "sweep", "train_zero_shot", "trajectories",
 )  # fmt: skip
 #: Flags of other programs that the pages mention.
 FOREIGN = {"--check", "--durations", "--fix", "--help", "--xla_gpu_deterministic_ops"}

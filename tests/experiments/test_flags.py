@@ -219,11 +219,21 @@ def prepare_sweep(recorder: Recorder) -> None:
     recorder.record("experiments.sweep.write_report")
 
 
+def prepare_serve(recorder: Recorder) -> None:
+    agent = SimpleNamespace(add_words=lambda path: recorder.calls.append(f"add_words({path})"))
+    recorder.record("tdanet_jax.agent.agent.load", gives=agent)
+    recorder.record("tdanet_jax.training.devices.keep_compiled", gives=None)
+    navigator = SimpleNamespace(camera=SimpleNamespace(limits=tuple))
+    recorder.record("experiments.serve.Navigator", gives=navigator)
+    recorder.record("experiments.serve.read_lines", gives=Ended)
+
+
 #: Command -> how its functions are recorded.
 PREPARE: dict[str, Callable[[Recorder], None]] = {
     "train_zero_shot": lambda r: r.record("tdanet_jax.workflows.train.train"),
     "evaluate": lambda r: r.record("tdanet_jax.workflows.evaluate.evaluate", gives=Ended),
     "share": lambda r: r.record("tdanet_jax.evaluation.saved_networks.share", gives=Ended),
+    "serve": prepare_serve,
     "replay": lambda r: agents(r, "tdanet_jax.io.files.write_text"),
     "trajectories": lambda r: agents(r, "tdanet_jax.analysis.pictures.trajectories"),
     "attention": lambda r: agents(r, "tdanet_jax.analysis.pictures.attention_episode"),
@@ -286,6 +296,33 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
                 "--checkpoint run --out new",
                 "--checkpoint run --out new --word-vectors words.txt",
             ),
+        },
+    ),
+    "serve": (
+        "--checkpoint run",
+        {
+            "--checkpoint": ("--checkpoint run", "--checkpoint other"),
+            "--forbid": "--forbid LookUp LookDown",
+            "--min-score": "--min-score 0.5",
+            "--keep-frames": "--keep-frames 2",
+            "--max-steps": "--max-steps 9",
+            "--seed": "--seed 5",
+            "--hfov": (
+                "--checkpoint run --hfov 60 --vfov 50",
+                "--checkpoint run --hfov 70 --vfov 50",
+            ),
+            "--vfov": (
+                "--checkpoint run --hfov 60 --vfov 50",
+                "--checkpoint run --hfov 60 --vfov 60",
+            ),
+            "--aspect": (
+                "--checkpoint run --hfov 60 --vfov 50",
+                "--checkpoint run --hfov 60 --aspect 2",
+            ),
+            "--horizon": "--horizon 10",
+            "--word-vectors": "--word-vectors words.txt",
+            "--words": "--words words.txt",
+            "--synonyms": "--synonyms mine.json",
         },
     ),
     "replay": (SHOW, {**ONE_EPISODE, "--shortest": "--shortest"}),

@@ -1,0 +1,56 @@
+"""`experiments.serve`: one line in, one line out."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from experiments import serve
+from tests.agent.test_agent import OLD_RUN
+
+FRAME = {"detections": [{"label": "sink", "box": [0.1, 0.3, 0.5, 0.8]}], "blocked": False}
+START = FRAME | {"target": "mug"}
+
+
+def serve_lines(monkeypatch: pytest.MonkeyPatch, lines: list[bytes], *flags: str) -> None:
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO(b"".join(lines))))
+    serve.main(["--checkpoint", str(OLD_RUN), *flags])
+
+
+def test_every_line_has_an_answer(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(serve, "LONGEST", 400)
+    lines = [json.dumps(frame).encode() + b"\n" for frame in (START, FRAME, FRAME)]
+    long = b'{"target": "' + b"x" * 1000 + b'"}\n'
+    bad = [b"\xff\n", b"\n", long]
+    flags = "--max-steps 2 --forbid Done --hfov 69 --vfov 55"
+    serve_lines(monkeypatch, [lines[0], *bad, *lines[1:]], *flags.split())
+    said, told = capsys.readouterr()
+    replies = [json.loads(line) for line in said.splitlines()]
+    assert [reply.get("steps") for reply in replies] == [1, None, None, 2, None]
+    assert replies[1]["error"].startswith("line 2: not JSON")
+    assert replies[2]["error"] == "line 4: longer than 400 bytes"
+    assert replies[3]["finished"]
+    assert replies[4]["error"] == "line 6: no episode has begun, or it is over: give a target"
+    assert told.startswith("ready: sees 69 degrees across and 55 down")
+
+
+def test_further_words_and_names(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "more.txt").write_text(f"qwertzu {' '.join(['0.1'] * 50)}\n")
+    (tmp_path / "mine.json").write_text('{"Mug": ["Humpen"]}')
+    frames = [START | {"target": name} for name in ("qwertzu", "humpen")]
+    serve_lines(
+        monkeypatch,
+        [json.dumps(frame).encode() + b"\n" for frame in frames],
+        "--words", str(tmp_path / "more.txt"), "--synonyms", str(tmp_path / "mine.json"),
+    )  # fmt: skip
+    replies = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [reply["steps"] for reply in replies] == [1, 1]
