@@ -1,8 +1,8 @@
-"""What other detectors give, as the detections of an agent.
+"""The output of other detectors, as the detections of an agent.
 
-Imports none of their libraries: what counts is which fields an output has. `read` recognises its
-type; it accepts the output for one image of ultralytics, supervision, torchvision, depthai, and
-`vision_msgs/Detection2DArray` of ROS.
+Imports none of their libraries: `read` recognises an output by its fields. It accepts the output
+for one image of ultralytics, supervision, torchvision, depthai (versions 2 and 3), and
+`vision_msgs/Detection2DArray` (ROS 1, and ROS 2 from Foxy on).
 
 Labels are those that the detector gives. Where it gives numbers, `names` says what they mean.
 Boxes are clipped to the image, and those outside of it left out; of turned boxes, the enclosing
@@ -22,14 +22,15 @@ Names = Mapping[Any, str] | Sequence[str]
 
 
 def read(output: Any, image_size: Any = None, names: Names | None = None) -> list[Detection]:
-    """The detections in one image, from whatever output this module knows.
+    """The detections in one image.
 
     Args:
       output: of a detector; a list with the output for a single image, as ultralytics and
         torchvision give it; or a list of `Detection`, which is returned as it is.
       image_size: width and height in pixels, or anything that has them, such as a `CameraInfo`.
         supervision, torchvision and `vision_msgs` need it, because their boxes are in pixels.
-      names: what the classes' numbers mean, if the output does not say.
+      names: what the classes' numbers mean, in place of what the output says, or if it does not
+        say; for torchvision `weights.meta["categories"]`.
 
     Raises:
       ValueError: the type is unknown, the size or the names are needed, or a box is none; the
@@ -39,37 +40,37 @@ def read(output: Any, image_size: Any = None, names: Names | None = None) -> lis
         if all(isinstance(found, Detection) for found in output):
             return [*output]
         if len(output) != 1:
-            raise ValueError(f"detections: {len(output)} outputs; give that for one image")
+            kinds = ", ".join(sorted({_kind(one) for one in output}))
+            raise ValueError(f"detections: a list of {len(output)} ({kinds}): {_KNOWN}")
         (output,) = output
     if _has(output, "orig_shape", "names", "boxes"):
-        return from_ultralytics(output, names)
+        return _ultralytics(output, names)
     if _has(output, "xyxy", "confidence", "class_id"):
-        return from_supervision(output, image_size, names)
+        return _supervision(output, image_size, names)
     if isinstance(output, Mapping) and {"boxes", "labels"} <= output.keys():
-        return from_torchvision(output, image_size, names)
+        return _torchvision(output, image_size, names)
     if _has(output, "detections"):
         first = next(iter(output.detections), None)
         if first is None or _has(first, "xmin", "label"):
-            return from_depthai(output, names)
+            return _depthai(output, names)
         if _has(first, "bbox", "results"):
-            return from_vision_msgs(output, image_size, names)
-    kind = f"{type(output).__module__}.{type(output).__qualname__}"
-    raise ValueError(
-        f"detections: {kind} is not known; give a list of Detection, or the output of ultralytics, "
-        "supervision, torchvision, depthai or vision_msgs"
-    )
+            return _vision_msgs(output, image_size, names)
+    raise ValueError(f"detections: {_kind(output)} is not known: {_KNOWN}")
 
 
-def from_ultralytics(results: Any, names: Names | None = None) -> list[Detection]:
-    """An `ultralytics.engine.results.Results`, with upright or with turned boxes.
+_KNOWN = (
+    "give a list of Detection, or for one image the output of ultralytics, supervision, "
+    "torchvision, depthai or vision_msgs"
+)
 
-    Args:
-      results: for one image.
-      names: by class; by default the model's own.
 
-    Raises:
-      ValueError: it has no boxes, as of a model that classifies images.
-    """
+def _kind(thing: Any) -> str:
+    kind = type(thing)
+    return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__name__}"
+
+
+def _ultralytics(results: Any, names: Names | None) -> list[Detection]:
+    """An `ultralytics.engine.results.Results`, with upright or with turned boxes."""
     found = results.boxes if results.boxes is not None else results.obb
     if found is None:
         raise ValueError("ultralytics: the results have no boxes; use a model that detects")
@@ -79,19 +80,8 @@ def from_ultralytics(results: Any, names: Names | None = None) -> list[Detection
     return in_image(rows, width, height)
 
 
-def from_supervision(
-    detections: Any, image_size: Any, names: Names | None = None
-) -> list[Detection]:
-    """A `supervision.Detections`, whose boxes are in pixels.
-
-    Args:
-      detections: in one image.
-      image_size: as in `read`.
-      names: by class; by default those in `data["class_name"]`.
-
-    Raises:
-      ValueError: the size or the names are missing.
-    """
+def _supervision(detections: Any, image_size: Any, names: Names | None) -> list[Detection]:
+    """A `supervision.Detections`; what its classes are called may be in its `data`."""
     width, height = _size("supervision", image_size)
     boxes = detections.xyxy.tolist()
     given = detections.data.get("class_name") if names is None else None
@@ -104,19 +94,10 @@ def from_supervision(
     return in_image(zip(labels, boxes, listed, strict=True), width, height)
 
 
-def from_torchvision(
+def _torchvision(
     output: Mapping[str, Any], image_size: Any, names: Names | None
 ) -> list[Detection]:
-    """What a detection model of torchvision gives for one image: boxes, labels and scores.
-
-    Args:
-      output: for one image.
-      image_size: as in `read`.
-      names: by class, such as `weights.meta["categories"]`.
-
-    Raises:
-      ValueError: the size or the names are missing.
-    """
+    """What a detection model of torchvision gives for one image."""
     width, height = _size("torchvision", image_size)
     boxes = output["boxes"].tolist()
     labels = [_label("torchvision", cls, names) for cls in output["labels"].tolist()]
@@ -124,16 +105,8 @@ def from_torchvision(
     return in_image(zip(labels, boxes, scores, strict=True), width, height)
 
 
-def from_depthai(message: Any, names: Names | None = None) -> list[Detection]:
-    """A `depthai.ImgDetections` or `SpatialImgDetections`, of version 2 or 3.
-
-    Args:
-      message: of one image.
-      names: by class; by default those that version 3 gives (`labelName`).
-
-    Raises:
-      ValueError: the names are missing.
-    """
+def _depthai(message: Any, names: Names | None) -> list[Detection]:
+    """A `depthai.ImgDetections` or `SpatialImgDetections`; version 3 may give `labelName`."""
     rows = []
     for found in message.detections:
         named = getattr(found, "labelName", "") if names is None else ""
@@ -142,19 +115,11 @@ def from_depthai(message: Any, names: Names | None = None) -> list[Detection]:
     return in_image(rows)
 
 
-def from_vision_msgs(message: Any, image_size: Any, names: Names | None = None) -> list[Detection]:
-    """A `vision_msgs/Detection2DArray`, of any version from ROS 1 and ROS 2 Foxy on.
+def _vision_msgs(message: Any, image_size: Any, names: Names | None) -> list[Detection]:
+    """A `vision_msgs/Detection2DArray`.
 
     Of several hypotheses about one object, the likeliest counts. A detection without any is left
     out. A score of 0, which is what a message holds where a detector sets none, is no score.
-
-    Args:
-      message: of one image.
-      image_size: as in `read`.
-      names: by class, which is a text that is often a number; not needed if it is a name.
-
-    Raises:
-      ValueError: the size or the names are missing.
     """
     width, height = _size("vision_msgs", image_size)
     rows = []
@@ -211,21 +176,27 @@ def _label(source: str, cls: Any, names: Names | None) -> str:
     if isinstance(cls, str) and not cls.isdigit():
         return names.get(cls, cls) if isinstance(names, Mapping) else cls
     if names is None:
-        raise ValueError(f"{source}: class {cls}: give `names`, what the classes' numbers mean")
+        raise ValueError(
+            f"{source}: class {cls}: say what the classes' numbers mean: "
+            "detectors.read(output, names=...)"
+        )
     number = int(cls)
     if isinstance(names, Mapping):
         found = next((names[key] for key in (number, str(number)) if key in names), None)
     else:
         found = names[number] if 0 <= number < len(names) else None
     if found is None:
-        raise ValueError(f"{source}: class {number}: is not among the {len(names)} `names`")
+        raise ValueError(f"{source}: class {number}: is not among the {len(names)} names")
     return found
 
 
 def _size(source: str, size: Any) -> tuple[float, float]:
     """Width and height of an image in pixels."""
     if size is None:
-        raise ValueError(f"{source}: boxes are in pixels: give `image_size`, width and height")
+        raise ValueError(
+            f"{source}: its boxes are in pixels: say in an image of which size, "
+            "detectors.read(output, image_size=(width, height))"
+        )
     if _has(size, "width", "height"):
         size = size.width, size.height
     try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 import jax
@@ -57,9 +57,15 @@ def shortest_path() -> Policy:
     return Policy(lambda weights, batch: (), act)
 
 
-def network(model: ActorCritic, words: jax.Array, greedy: bool = False) -> Policy:
-    """A trained actor-critic; its actions are sampled, or the most probable ones if `greedy`."""
+def network(
+    model: ActorCritic, words: jax.Array, greedy: bool = False, forbidden: Collection[Action] = ()
+) -> Policy:
+    """A trained actor-critic; its actions are sampled, or the most probable ones if `greedy`.
+
+    Actions in `forbidden` are never taken.
+    """
     observe = jax.vmap(dynamics.observe, (0, None))
+    never = np.array([*forbidden], int)
 
     def start(weights: Any, batch: int) -> Any:
         class_table = actor_critic.prepare(model, weights, words)
@@ -71,8 +77,9 @@ def network(model: ActorCritic, words: jax.Array, greedy: bool = False) -> Polic
         class_table, recurrent = memory
         obs = observe(state, params)
         recurrent, out, _ = actor_critic.act(model, weights, class_table, recurrent, obs)
-        sampled = jax.random.categorical(key, out.logits)
-        action = jnp.argmax(out.logits, axis=-1) if greedy else sampled
+        logits = out.logits.at[:, never].set(-jnp.inf) if len(never) else out.logits
+        sampled = jax.random.categorical(key, logits)
+        action = jnp.argmax(logits, axis=-1) if greedy else sampled
         return (class_table, recurrent), action
 
     return Policy(start, act)

@@ -249,6 +249,20 @@ def test_sampled_actions_follow_the_probabilities_of_the_network(
     chex.assert_shape(records.actions, (4000, 1))
 
 
+@pytest.mark.parametrize("greedy", [True, False])
+def test_forbidden_actions_are_never_taken(
+    rooms: SceneTables, params: EnvParams, greedy: bool
+) -> None:
+    weights, words = network_weights(len(rooms.classes))
+    chosen = drawn(rooms, 20)
+    state = jax.vmap(dynamics.start, (0, 0, None))(chosen.pose, chosen.target, params)
+    forbidden = [action for action in Action if action != Action.LOOK_UP]
+    policy = policies.network(MODEL, words, greedy, forbidden)
+    memory = policy.start(weights, len(chosen))
+    _, taken = jax.jit(policy.act)(weights, memory, KEY, state, params)
+    assert {*taken.tolist()} == {Action.LOOK_UP}
+
+
 @pytest.mark.parametrize("batched", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_stacked_networks_play_as_each_of_them_alone(
     rooms: SceneTables, params: EnvParams, batched: bool
