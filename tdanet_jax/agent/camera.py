@@ -50,7 +50,7 @@ class Camera:
     def __post_init__(self, aspect: float | None) -> None:
         _check("hfov", self.hfov, 0, 180)
         if (self.vfov is None) == (aspect is None):
-            raise ValueError("camera: give vfov, in degrees, or aspect, width over height")
+            raise ValueError("camera: give either vfov, in degrees, or aspect, width over height")
         if aspect is not None:
             _check("aspect", aspect, 0, 100)
             tangent = math.tan(math.radians(self.hfov / 2)) / aspect

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 from tdanet_jax.agent import detectors
-from tdanet_jax.agent.detection import Detection
+from tdanet_jax.agent.detection import OVERHANG, Detection
 from tdanet_jax.agent.navigator import Navigator
 from tdanet_jax.io.untrusted import FileError, jsons
 
@@ -72,24 +72,26 @@ def _detections(frame: dict[str, Any], source: str) -> list[Detection]:
     """The detections of a frame, as shares of its image."""
     if not isinstance(frame.get("detections"), list):
         raise FileError(source, "detections is missing, or not a list")
-    size = (1.0, 1.0)
-    if frame.get("image_size") is not None:
-        width, height = _numbers(source, frame["image_size"], "image_size", 2)
-        size = width, height
-        if min(size) <= 0:
-            raise FileError(source, "image_size is not above 0")
+    size = frame.get("image_size")
+    width, height = (1.0, 1.0) if size is None else _numbers(source, size, "image_size", 2)
+    if min(width, height) <= 0:
+        raise FileError(source, "image_size is not above 0")
     rows = []
     for i, item in enumerate(frame["detections"]):
-        one = _object(source, item, DETECTION, f"detection {i}")
+        one, what = _object(source, item, DETECTION, f"detection {i}"), f"detection {i}"
         if not isinstance(one.get("label"), str):
-            raise FileError(source, f"detection {i}: label is not a text")
-        score = one.get("score")
+            raise FileError(source, f"{what}: label is not a text")
+        box, score = _numbers(source, one.get("box"), f"{what}: box", 4), one.get("score")
+        if size is None and not all(abs(corner - 0.5) <= 0.5 + OVERHANG for corner in box):
+            raise FileError(
+                source,
+                f"{what}: box is not within the image, from 0 to 1; give image_size if it is in "
+                "pixels, or [1, 1] if it may reach beyond",
+            )
         if score is not None:
-            score = jsons.number(source, score, f"detection {i}: score", LARGEST)
-        rows.append(
-            (one["label"], _numbers(source, one.get("box"), f"detection {i}: box", 4), score)
-        )
-    return detectors.in_image(rows, *size)
+            score = jsons.number(source, score, f"{what}: score", LARGEST)
+        rows.append((one["label"], box, score))
+    return detectors.in_image(rows, width, height)
 
 
 def _object(source: str, value: Any, fields: tuple[str, ...], what: str = "") -> dict[str, Any]:

@@ -157,8 +157,11 @@ def test_the_camera_of_a_message_of_ros(name):
         ({"hfov": 0, "vfov": 50}, "camera: hfov 0: must be between 0 and 180"),
         ({"hfov": 180, "vfov": 50}, "camera: hfov 180: must be between"),
         ({"hfov": 69, "vfov": float("nan")}, "camera: vfov nan: must be between"),
-        ({"hfov": 69}, "camera: give vfov, in degrees, or aspect"),
-        ({"hfov": 69, "vfov": 55, "aspect": 1.3}, "camera: give vfov, in degrees, or aspect"),
+        ({"hfov": 69}, "camera: give either vfov, in degrees, or aspect"),
+        (
+            {"hfov": 69, "vfov": 55, "aspect": 1.3},
+            "camera: give either vfov, in degrees, or aspect",
+        ),
         ({"hfov": 69, "aspect": 0}, "camera: aspect 0: must be between 0 and 100"),
         ({"hfov": 69, "vfov": 55, "height": -1}, "camera: height -1: must be between"),
         ({"hfov": 69, "vfov": 55, "horizon": 95}, "camera: horizon 95: must be between -90 and 90"),

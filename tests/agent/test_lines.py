@@ -39,6 +39,11 @@ def test_an_episode(ask):
     assert ask(frame) == {"action": "LookUp", "steps": 2, **more}
     assert ask.agent.shown() == {"sink": pytest.approx((0, 0.3, 0.5, 0.8))}
     assert ask.agent.calls[1][3] is True
+    rounded = [{"label": "sink", "box": [0.1, 0.3, 0.5, 1.004]}]
+    beyond = [{"label": "sink", "box": [0.1, 0.3, 0.5, 1.7]}]
+    assert [d.y2 for d in lines._detections({"detections": rounded}, "")] == [1]
+    beyond_frame = {"detections": beyond, "image_size": [1, 1]}
+    assert [d.y2 for d in lines._detections(beyond_frame, "")] == [1]
     done = ask({"detections": [], "blocked": None, "pose": None})
     assert done == {"action": "Done", "steps": 3, "finished": True, "outcome": "done"}
     assert "give a target" in ask({"detections": []})["error"]
@@ -63,6 +68,10 @@ def test_an_episode(ask):
         (
             {"detections": [SINK | {"box": [1, 2, 3]}]},
             "detection 0: box is not a list of 4 numbers",
+        ),
+        (
+            {"detections": [SINK, SINK | {"box": [64, 144, 320, 384]}]},
+            "line 7: detection 1: box is not within the image, from 0 to 1; give image_size if it",
         ),
         ({"detections": [SINK | {"box": [0, 0, "a", 1]}]}, "detection 0: box is not a number"),
         ({"detections": [SINK | {"box": [0.5, 0, 0.4, 1]}]}, "line 7: sink at (0.5, 0.0, 0.4, 1"),
