@@ -16,6 +16,7 @@ import numpy as np
 
 from tdanet_jax.analysis import trace
 from tdanet_jax.evaluation import episodes, metrics, policies, report, rollout
+from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.scenes import dataset
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.vocabulary import Action
@@ -35,6 +36,14 @@ def through(tables: SceneTables, hfov: float, vfov: float, mapped: bool) -> Scen
     return dataclasses.replace(tables, row_box=corners.astype(tables.row_box.dtype))
 
 
+def looking(tables: SceneTables, chosen: Episodes, horizon: int) -> Episodes:
+    """The episodes, which begin with the camera at a horizon."""
+    grid = tables.grid
+    position, rotation, _ = grid.split(chosen.pose)
+    pose = grid.join(position, rotation, grid.horizons.index(horizon))
+    return dataclasses.replace(chosen, pose=pose.astype(chosen.pose.dtype))
+
+
 def main(run: str = "agents/18-4-best", hfov: float = 69, vfov: float = 55) -> None:
     """Prints success rate and SPL of each case, of sampled actions."""
     if not (0 < hfov <= 90 and 0 < vfov <= 90):
@@ -42,17 +51,21 @@ def main(run: str = "agents/18-4-best", hfov: float = 69, vfov: float = 55) -> N
     rooms = dataset.load_rooms(None)
     raw, mapped = (through(rooms.tables, hfov, vfov, chosen) for chosen in (False, True))
     camera = f"{hfov:g} x {vfov:g} degrees"
-    for case, tables, forbidden in (
-        ("90 x 90 degrees", rooms.tables, ()),
-        (f"{camera}, as they are", raw, ()),
-        (f"{camera}, mapped", mapped, ()),
-        ("90 x 90 degrees, no tilt", rooms.tables, TILTS),
-        (f"{camera}, mapped, no tilt", mapped, TILTS),
+    for case, tables, forbidden, horizon in (
+        ("90 x 90 degrees", rooms.tables, (), 0),
+        (f"{camera}, as they are", raw, (), 0),
+        (f"{camera}, mapped", mapped, (), 0),
+        ("90 x 90 degrees, no tilt", rooms.tables, TILTS, 0),
+        (f"{camera}, mapped, no tilt", mapped, TILTS, 0),
+        (f"{camera}, mapped, always 30 degrees down", mapped, TILTS, 30),
     ):
         player = trace.load_player(run, dataclasses.replace(rooms, tables=tables))
         task = player.task
         policy = policies.network(player.model, task.words, forbidden=forbidden)
-        lists = episodes.load(rooms.tables, task.split, task.extras)
+        lists = {
+            group: looking(rooms.tables, chosen, horizon)
+            for group, chosen in episodes.load(rooms.tables, task.split, task.extras).items()
+        }
         played = rollout.evaluate_lists(policy, player.weights, task.eval_params, lists, seed=0)
         for group, pair in played.items():
             columns = report.columns(rooms.tables, *pair)

@@ -165,8 +165,8 @@ class Navigator:
             navigator stays as it was.
         """
         if self.target is None or self.finished:
-            over = "no episode has begun" if self.target is None else f"it is over: {self.outcome}"
-            raise ValueError(f"{over}; begin an episode with reset(target)")
+            over = "no episode has begun" if self.target is None else "the episode is over"
+            raise ValueError(f"{over}; begin one with reset(target)")
         if self.steps and (pose is None) != (self._origin is None):
             raise ValueError("pose: give one in every step of an episode, or in none")
         measured = None if pose is None else self._measure(pose)

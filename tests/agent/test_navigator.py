@@ -150,13 +150,13 @@ def test_an_episode_ends_with_done_or_at_its_limit(navigator):
     nav = navigator("LookUp", "Done", max_steps=2)
     assert [nav.step([]), nav.finished, nav.steps] == ["LookUp", False, 1]
     assert [nav.step([]), nav.finished, nav.outcome] == ["Done", True, "done"]
-    with pytest.raises(ValueError, match=r"it is over: done; begin an episode with reset"):
+    with pytest.raises(ValueError, match=r"the episode is over; begin one with reset"):
         nav.step([])
     long = navigator("LookUp", "LookUp", max_steps=2)
     assert [long.step([]), long.step([]), long.outcome] == ["LookUp", "LookUp", "step limit"]
     assert not long.reset("sink").finished
     assert (long.steps, long.decision) == (0, None)
-    with pytest.raises(ValueError, match="no episode has begun; begin an episode with reset"):
+    with pytest.raises(ValueError, match="no episode has begun; begin one with reset"):
         Navigator(nav.agent).step([])
 
 
