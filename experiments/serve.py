@@ -94,7 +94,7 @@ def serve(navigator: Navigator, stream: BinaryIO) -> None:
         elif not line.strip():
             continue
         else:
-            reply = lines.answer(navigator, line.decode("utf-8", "replace"), source)
+            reply = lines.answer(navigator, line.decode("utf-8-sig", "replace"), source)
         print(json.dumps(reply), flush=True)
 
 

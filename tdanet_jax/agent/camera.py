@@ -22,6 +22,9 @@ from tdanet_jax.vocabulary import FIELD_OF_VIEW, VISIBILITY_DISTANCE
 #: Metres above the floor of the camera with which agents are trained in iTHOR's rooms.
 TRAINED_HEIGHT = 1.58
 
+#: Least and greatest field of view, in degrees; less would be radians.
+ANGLES = (5, 180)
+
 #: A direction: how far to the right, down and ahead.
 Ray = tuple[float, float, float]
 
@@ -48,7 +51,7 @@ class Camera:
     horizon: float = 0.0
 
     def __post_init__(self, aspect: float | None) -> None:
-        _check("hfov", self.hfov, 0, 180)
+        _check("hfov", self.hfov, *ANGLES)
         if (self.vfov is None) == (aspect is None):
             raise ValueError("camera: give either vfov, in degrees, or aspect, width over height")
         if aspect is not None:
@@ -56,7 +59,7 @@ class Camera:
             tangent = math.tan(math.radians(self.hfov / 2)) / aspect
             object.__setattr__(self, "vfov", 2 * math.degrees(math.atan(tangent)))
         assert self.vfov is not None
-        _check("vfov", self.vfov, 0, 180)
+        _check("vfov", self.vfov, *ANGLES)
         if self.height is not None:
             _check("height", self.height, 0, 100)
         _check("horizon", self.horizon, -90, 90)

@@ -51,6 +51,8 @@ class NavigatorConfig:
 
     def check(self) -> None:
         """Raises ValueError, with one line that names the field, if a value is out of range."""
+        if isinstance(self.forbid, str):
+            raise ValueError(f"--forbid {self.forbid}: give a tuple of names")
         for name in self.forbid:
             if name not in ACTION_NAMES:
                 raise ValueError(f"--forbid {name}: choose among {', '.join(ACTION_NAMES)}")

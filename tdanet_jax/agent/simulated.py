@@ -70,7 +70,13 @@ class SimulatedRobot:
         return detectors.in_image((*one, None) for one in zip(view.classes, boxes, strict=True))
 
     def do(self, action: str) -> None:
-        """Takes an action; `blocked` then says whether it bumped into something."""
+        """Takes an action; `blocked` then says whether it bumped into something.
+
+        Raises:
+          ValueError: there is no such action.
+        """
+        if action not in ACTION_NAMES:
+            raise ValueError(f"action {action}: choose among {', '.join(ACTION_NAMES)}")
         grid, number = self._tables.grid, ACTION_NAMES.index(action)
         place, rotation, horizon = (int(part) for part in grid.split(self.state))
         ahead = int(self._tables.next_position[place, rotation])

@@ -154,7 +154,7 @@ def test_the_camera_of_a_message_of_ros(name):
 @pytest.mark.parametrize(
     ("given_", "message"),
     [
-        ({"hfov": 0, "vfov": 50}, "camera: hfov 0: must be between 0 and 180"),
+        ({"hfov": 1.2, "vfov": 50}, "camera: hfov 1.2: must be between 5 and 180"),
         ({"hfov": 180, "vfov": 50}, "camera: hfov 180: must be between"),
         ({"hfov": 69, "vfov": float("nan")}, "camera: vfov nan: must be between"),
         ({"hfov": 69}, "camera: give either vfov, in degrees, or aspect"),

@@ -258,6 +258,7 @@ def test_a_step_that_fails_changes_nothing(moving_agent):
     ("config", "message"),
     [
         ({"forbid": ("Jump",)}, "--forbid Jump: choose among MoveAhead, RotateLeft"),
+        ({"forbid": "LookUp"}, "--forbid LookUp: give a tuple of names"),
         ({"forbid": ACTION_NAMES}, "--forbid: every action is forbidden"),
         ({"min_score": 1.5}, "--min-score 1.5: must be from 0 to 1"),
         ({"min_score": float("nan")}, "--min-score nan: must be from 0 to 1"),

@@ -74,6 +74,8 @@ def test_a_camera_that_the_rooms_cannot_give_is_refused(room, camera):
         SimulatedRobot(SCENE, camera, tables=room)
 
 
-def test_a_scene_that_is_not_there_is_refused(room):
+def test_what_is_not_there_is_refused(room):
+    with pytest.raises(ValueError, match="action Jump: choose among MoveAhead, RotateLeft"):
+        SimulatedRobot(SCENE, tables=room).do("Jump")
     with pytest.raises(ValueError, match="FloorPlan999: no such scene"):
         SimulatedRobot("FloorPlan999", tables=room)

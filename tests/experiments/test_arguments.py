@@ -114,7 +114,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("", "Missing from serve: --checkpoint PATH"),
         ("--checkpoint nowhere", "nowhere/config.json: no such file"),
         ("--checkpoint bare", "bare/checkpoints: no checkpoint"),
-        ("--checkpoint bare --hfov 200 --vfov 50", "camera: hfov 200.0: must be between 0 and 180"),
+        ("--checkpoint bare --hfov 200 --vfov 50", "camera: hfov 200.0: must be between 5 and 180"),
         ("--checkpoint bare --hfov 60", "camera: give either vfov, in degrees, or aspect"),
         ("--checkpoint bare --vfov 60", "--vfov and --aspect need --hfov"),
         ("--checkpoint bare --forbid Jump", "invalid choice 'Jump' for argument '--forbid'"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import io
 import json
 import sys
@@ -30,7 +31,7 @@ def test_every_line_has_an_answer(
     long = b'{"target": "' + b"x" * 1000 + b'"}\n'
     bad = [b"\xff\n", b"\n", long]
     flags = "--max-steps 2 --forbid Done --hfov 69 --vfov 55"
-    serve_lines(monkeypatch, [lines[0], *bad, *lines[1:]], *flags.split())
+    serve_lines(monkeypatch, [codecs.BOM_UTF8 + lines[0], *bad, *lines[1:]], *flags.split())
     said, told = capsys.readouterr()
     replies = [json.loads(line) for line in said.splitlines()]
     assert [reply.get("steps") for reply in replies] == [1, None, None, 2, None]
