@@ -33,6 +33,18 @@ ODOMETRY, TRIANGULATION = "sensors/odometry.py", "sensors/triangulation.py"
 NOISE = "sensors/noise.py"
 TEST_TDANET = "models/test_tdanet.py"
 FAULTS = (
+    Fault("boxes of a narrow camera as they are", "agent/camera.py",
+          "_rays(box, self.hfov, self.vfov or self.hfov)", "_rays(box, 90, 90)", "agent/test_camera.py"),
+    Fault("what is kept does not turn", "agent/navigator.py", "turned(found, right,",
+          "turned(found, 0,", "agent/test_navigator.py"),
+    Fault("a measured pose is not believed", ODOMETRY, "place=measured.place - after.cell",
+          "place=0 * measured.place", "sensors/test_odometry.py"),
+    Fault("what is forbidden is done", AGENT, "logits.at[np.array([*forbidden])].set(-jnp.inf)",
+          "logits", "agent/test_agent.py"),
+    Fault("boxes in pixels are outside", "agent/lines.py", "if size is None and not all(",
+          "if False and not all(", "agent/test_lines.py"),
+    Fault("a simulated robot is never blocked", "agent/simulated.py",
+          "number == Action.MOVE_AHEAD and ahead == place", "False", "agent/test_simulated.py"),
     Fault("variants know of test rooms", "scenes/variants.py", "known = statistics(scenes)",
           "known = statistics(rooms.scenes(rooms.tables.scenes))", "scenes/test_variants.py"),
     Fault("variants show hidden classes", "task.py", "zero_shot.hide_classes(varied, split.hidden)",
