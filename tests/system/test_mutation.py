@@ -71,7 +71,7 @@ FAULTS = (
     Fault("a refused run leaves its folder", "io/files.py", "if created and [", "if False and [",
           "training/test_devices.py"),
     Fault("a budget that is spent is taken", "workflows/train.py", "!= before and run.progress >= 1.0",
-          "!= before and False", "experiments/test_train_zero_shot.py"),
+          "!= before and False", "training/test_run_bookkeeping.py"),
     Fault("rotation sign", ODOMETRY, "Action.ROTATE_RIGHT, 1, 0", "Action.ROTATE_RIGHT, -1, 0",
           "env/test_dynamics.py"),
     Fault("impossible look", ODOMETRY, "Action.LOOK_UP, higher, horizon",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax import config as configs
+from tdanet_jax.config import CONFIG_FILE, LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.task import Task, make_task
 from tdanet_jax.training.checkpoint import Checkpoints
@@ -18,6 +20,7 @@ from tdanet_jax.training.journal import read_metrics
 from tdanet_jax.training.learner import TrainState
 from tdanet_jax.training.run import _UPDATE_MEANS, Run
 from tdanet_jax.words import WordVectors
+from tdanet_jax.workflows.train import _check_longer as check_longer
 
 CONFIG = TrainConfig(
     minutes=10.0,
@@ -101,3 +104,15 @@ def test_time_and_rows_continue(task: Task, tmp_path: Path) -> None:
     assert again.progress < 1.0
     again._record(again.state, metrics, again.progress, took=0.75)
     assert list(again.chunks()) == []  # ten minutes in all: the budget is spent
+
+
+def test_a_budget_that_is_spent_already_is_refused(task: Task, tmp_path: Path) -> None:
+    run = saved(tmp_path, task)
+    configs.save(CONFIG, tmp_path / CONFIG_FILE)
+    check_longer(run)  # to evaluate it again
+    run.config = dataclasses.replace(CONFIG, minutes=20.0)
+    check_longer(run)
+    assert run.progress == pytest.approx(360.25 / 1200)
+    run.config = dataclasses.replace(CONFIG, minutes=5.0)
+    with pytest.raises(ValueError, match=r"--minutes 5.0: .* has already trained as long"):
+        check_longer(run)
