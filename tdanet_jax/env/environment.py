@@ -42,7 +42,7 @@ class Environment:
 
     def observation_space(self, params: EnvParams | None = None) -> Dict:
         """The fields of `Observation` that every environment has."""
-        rows = (params or self.default_params).rows
+        rows = (params or self.default_params).max_detections
         return Dict(
             {
                 "classes": Box(0, len(self.class_names) - 1, (rows,), jnp.int32),
@@ -105,7 +105,7 @@ class FlatObservations:
         """Vectors of the size that `params` give; the same in training and in tests."""
         params = params or self.default_params
         width = self.env.words.shape[1]
-        size = params.rows * (4 + width) + width
+        size = params.max_detections * (4 + width) + width
         if params.spec.sensors:
             size += suite.width(params.spec)
         return Box(-jnp.inf, jnp.inf, (size,))

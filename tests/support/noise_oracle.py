@@ -41,19 +41,19 @@ def detect(
     seen: Sequence[Seen], longest: int, everything: Sequence[Seen], bits: Bits,
     level: Mapping[str, float], known: Sequence[int], similar: Sequence[Sequence[int]],
 ) -> list[Detected | None]:  # fmt: skip
-    """The rows of a frame: `longest` for what is there, four for duplicates, four for false ones.
+    """The rows of a frame: what is there, then up to four false ones and duplicates.
 
     Args:
       seen: what is in view.
-      longest: rows for it.
+      longest: number of rows.
       everything: all detections of all views.
-      bits: [8][longest + 9].
+      bits: [8][longest + 5].
       level: levels of noise by name.
       known: classes that are detected anywhere, ascending.
       similar: what each class is confused with.
     """
-    miss, change, pick, dx, dy, dw, dh, extra = bits
-    rows: list[Detected | None] = [None] * (longest + 8)
+    miss, change, pick, dx, dy, dw, dh, _ = bits
+    rows: list[Detected | None] = [None] * longest
     shown = []
     for i, one in enumerate(seen):
         tiny = level["small_misses"] * math.exp(-math.sqrt(one.box[2]) / 0.1)
@@ -87,20 +87,18 @@ def detect(
     for i, one in enumerate(seen):
         if shown[i]:
             rows[i] = perceived(one, i, known_label=False)
-    for k in range(4):
-        i = longest + k
-        if seen and share(miss[i]) < level["duplicates"] * len(seen) / 4:
-            copied = extra[i] * len(seen) // 65536
-            if shown[copied]:
-                rows[i] = perceived(seen[copied], i, known_label=False)
-    for k in range(4):
-        i = longest + 4 + k
-        if share(miss[i]) < level["false_positives"] / 4:
-            at = int((extra[i] * 65536 + pick[i]) * len(everything) / 2**32)
-            one = everything[at]
+    for k in range(min(4, longest - len(seen))):
+        i = len(seen) + k
+        false, again, copy, high, low, *_ = (field[longest + k] for field in bits)
+        if share(false) < level["false_positives"] / 4:
+            one = everything[int((high * 65536 + low) * len(everything) / 2**32)]
             x1, y1, x2, y2 = one.extent
             box = ((x1 + x2) / 2, (y1 + y2) / 2, (x2 - x1) * (y2 - y1))
             rows[i] = perceived(Seen(one.cls, box, one.extent), i, known_label=True)
+        elif seen and share(again) < level["duplicates"] * len(seen) / 4:
+            copied = copy * len(seen) // 65536
+            if shown[copied]:
+                rows[i] = perceived(seen[copied], i, known_label=False)
     return rows
 
 
