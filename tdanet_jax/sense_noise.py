@@ -117,6 +117,8 @@ PRESETS: Mapping[str, SenseNoise] = {
 }  # fmt: skip
 #: `--noise sweep`: every kind of noise below, one after the other.
 SWEEP = "sweep"
+#: The rows of a sweep, written after every level.
+SWEEP_FILE = "noise.json"
 
 
 def scaled(noise: SenseNoise, factor: float) -> SenseNoise:
