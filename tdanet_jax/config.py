@@ -105,6 +105,9 @@ class NetworkConfig:
     triangulation: bool = False
     """Requires --odometry. Estimates the target's position from the bearings of its past
     detections. Not in the paper; for models that are shown a box of every object."""
+    scores: bool = False
+    """Show the detector's confidence in each detection, 1 without noise. Not in the paper; for
+    models that are shown a box of every object."""
     sensors: tuple[str, ...] = ()
     """Further sensors: dotted names of custom modules with a function `make` (docs/sensors.md)."""
     inner_rate: float = 1e-4
@@ -121,7 +124,8 @@ class NetworkConfig:
         """What the flags ask to show the agent; the model decides on rows and image in the end."""
         flags = {"odometry": self.odometry, "triangulation": self.triangulation}
         chosen = (*(name for name, on in flags.items() if on), *self.sensors)
-        return ObservationSpec(rows=self.rows, sensors=tuple(dict.fromkeys(chosen)))
+        sensors = tuple(dict.fromkeys(chosen))
+        return ObservationSpec(rows=self.rows, sensors=sensors, scores=self.scores)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -43,6 +43,11 @@ BOTH = ("odometry", "triangulation")
             "--triangulation: needs a box of every object, which --image features does not show; "
             "use --no-triangulation",
         ),
+        (
+            ObservationSpec(rows="class", scores=True),
+            "--scores: needs a box of every object, which --rows class does not show; "
+            "use --no-scores",
+        ),
     ],
 )
 def test_a_combination_that_does_not_go_together_is_refused_in_one_line(

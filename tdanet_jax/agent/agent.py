@@ -241,9 +241,16 @@ class Agent:
             _, found = merge_classes(owner[order], corners[order])
         else:
             owner, found = np.arange(len(labels)), centre_and_area(corners)
+        if self.spec.scores:
+            given = [getattr(one, "score", None) for one in detections]
+            scores = [1.0 if score is None else score for score in given]
+            found = np.column_stack([found, scores])
         count = len(labels)
         rows = max(-(-count // ROW_BLOCK), 1) * ROW_BLOCK
-        classes, boxes = np.zeros((1, rows), np.int32), np.zeros((1, rows, 3), np.float32)
+        classes, boxes = (
+            np.zeros((1, rows), np.int32),
+            np.zeros((1, rows, found.shape[1]), np.float32),
+        )
         classes[0, :count], boxes[0, :count] = labels, found
         observation = Observation(
             classes=jnp.asarray(classes),

@@ -160,6 +160,8 @@ def _frame(state: EnvState, params: EnvParams) -> Frame:
         is_target = classes == target
         area = jnp.minimum(boxes[:, 2] * jnp.where(is_target, state.area_factor, 1.0), 1.0)
         boxes = boxes.at[:, 2].set(area)
+    if params.spec.scores:
+        boxes = jnp.concatenate([boxes, mask[:, None].astype(jnp.float32)], axis=1)
     return Frame(jnp.where(mask, classes, 0), boxes, mask, target)
 
 

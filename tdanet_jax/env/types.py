@@ -96,7 +96,7 @@ class Observation(struct.PyTreeNode):
     """
 
     classes: jax.Array  # [K] int32, class of each detection; 0 in padding
-    boxes: jax.Array  # [K, 3] float32, x, y, S
+    boxes: jax.Array  # [K, 3] float32, x, y, S; [K, 4] with the score, if it is shown
     mask: jax.Array  # [K] bool, False in padding
     target: jax.Array  # int32, class of the target
     empty: jax.Array  # bool, no detection at all

@@ -40,7 +40,7 @@ LOOKALIKES = (
 )  # fmt: skip
 
 #: Fields of a row's column of random bits.
-_MISS, _CHANGE, _CLASS, _X, _Y, _WIDTH, _HEIGHT = range(7)
+_MISS, _CHANGE, _CLASS, _X, _Y, _WIDTH, _HEIGHT, _SCORE = range(8)
 #: Fields of an extra detection's column; the last two are one number of 32 bits.
 _FALSE, _AGAIN, _COPIED, _STRANGE, _STRANGE_LOW = range(5)
 #: Fields of the motion's column.
@@ -58,6 +58,7 @@ class NoiseLevels(NamedTuple):
     confusions: jax.Array
     jitter: jax.Array
     truncation: jax.Array
+    scores: jax.Array
     distance_bias: jax.Array
     distance_noise: jax.Array
     turn_bias: jax.Array
@@ -77,8 +78,8 @@ _SIGNED = np.array(
 class NoiseParams(struct.PyTreeNode):
     """What the environment needs for senses that err; part of `EnvParams`."""
 
-    low: jax.Array  # [16] float32, least levels of an episode, in the order of `NoiseLevels`
-    high: jax.Array  # [16] float32, greatest levels
+    low: jax.Array  # [17] float32, least levels of an episode, in the order of `NoiseLevels`
+    high: jax.Array  # [17] float32, greatest levels
     corners: jax.Array  # [N + K, 4] float32, x1, y1, x2, y2 of each detection's extent
     known: jax.Array  # [A] int32, ascending: the classes that are detected anywhere
     similar: jax.Array  # [C, SIMILAR] int32, what a class is confused with
@@ -90,14 +91,14 @@ class EpisodeNoise(struct.PyTreeNode):
     """The noise of one episode; part of `EnvState`."""
 
     key: jax.Array  # [2] uint32, data of the episode's key
-    levels: jax.Array  # [16] float32, in the order of `NoiseLevels`
+    levels: jax.Array  # [17] float32, in the order of `NoiseLevels`
 
 
 class Detections(NamedTuple):
     """The rows of a frame."""
 
     classes: jax.Array  # [K] int32
-    boxes: jax.Array  # [K, 3] float32
+    boxes: jax.Array  # [K, 3] float32, or [K, 4] with scores
     mask: jax.Array  # [K] bool
 
 
@@ -218,17 +219,20 @@ def detect(
         return rows
 
     classes = place(seen.classes, seen.classes[copied], row_class[strange])
-    boxes = place(seen.boxes, seen.boxes[copied], strange_box)
+    boxes = place(seen.boxes[:, :3], seen.boxes[copied, :3], strange_box)
     corners = place(corners, corners[copied], params.corners[strange])
     mask = place(there, again, jnp.ones_like(false))
     is_false = place(jnp.zeros_like(there), jnp.zeros_like(false), jnp.ones_like(false))
-    classes = _labels(classes, own, levels, params, is_false)
+    labels = _labels(classes, own, levels, params, is_false)
+    scores = _scores(~is_false & (labels == classes), boxes, own, levels)
     boxes, visible = _boxes(boxes, corners, own, levels)
     mask &= visible
+    if seen.boxes.shape[1] > 3:
+        boxes = jnp.concatenate([boxes, scores], axis=1)
     if params.one_per_class:
         earlier = jnp.tril(jnp.ones((count, count), bool), -1)
-        mask &= ~jnp.any(earlier & mask & (classes == classes[:, None]), axis=1)
-    return Detections(jnp.where(mask, classes, 0), jnp.where(mask[:, None], boxes, 0.0), mask)
+        mask &= ~jnp.any(earlier & mask & (labels == labels[:, None]), axis=1)
+    return Detections(jnp.where(mask, labels, 0), jnp.where(mask[:, None], boxes, 0.0), mask)
 
 
 def _labels(
@@ -246,6 +250,15 @@ def _labels(
     other = params.known[jnp.minimum(at, params.known.shape[0] - 1)]
     alike = params.similar[classes, (bits[_CLASS] >> 14).astype(jnp.int32)]
     return jnp.where(swap, other, jnp.where(confuse, alike, classes))
+
+
+def _scores(right: jax.Array, boxes: jax.Array, bits: jax.Array, levels: NoiseLevels) -> jax.Array:
+    """The detector's confidence in each row, [K, 1]."""
+    one, other = bits[_SCORE] >> 8, bits[_SCORE] & 255
+    drawn = jnp.where(right, jnp.maximum(one, other), jnp.minimum(one, other))
+    of_size = 1 - jnp.exp(-jnp.sqrt(boxes[:, 2]) / SMALL_SIDE) / 2
+    sure = drawn.astype(jnp.float32) * jnp.float32(2.0**-8) * of_size
+    return (1 - levels.scores * (1 - sure))[:, None]
 
 
 def _boxes(

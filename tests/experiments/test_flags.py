@@ -498,7 +498,7 @@ OF_THE_TASK: dict[str, tuple[Any, str]] = {
     "odometry": (True, "tdanet"), "triangulation": (True, "tdanet"),
     "sensors": (("odometry",), "tdanet"), "inner_rate": (0.1, "savn"),
     "first_order": (True, "savn"), "precision": ("bfloat16", "tdanet"), "split": ("14/8", "tdanet"),
-    "model": ("ssnet", "tdanet"), "noise": ("mix", "tdanet"),
+    "model": ("ssnet", "tdanet"), "noise": ("mix", "tdanet"), "scores": (True, "tdanet"),
 }  # fmt: skip
 #: Settings with a test of their own below.
 HERE = ("data", "word_vectors", "checkpoint_minutes")

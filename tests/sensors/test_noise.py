@@ -69,10 +69,11 @@ ROW_CLASS = jnp.array([one.cls for one in TABLE] + [0] * K, jnp.int32)
 
 
 def frame_of(seen: list[Seen]) -> tuple[Detections, jax.Array]:
-    classes, boxes = np.zeros(K, np.int32), np.zeros((K, 3), np.float32)
+    classes, boxes = np.zeros(K, np.int32), np.zeros((K, 4), np.float32)
     corners, mask = np.ones((K, 4), np.float32), np.arange(K) < len(seen)
     for i, one in enumerate(seen):
-        classes[i], boxes[i], corners[i] = one
+        classes[i], boxes[i, :3], corners[i] = one
+    boxes[:, 3] = mask
     return Detections(*map(jnp.asarray, (classes, boxes, mask))), jnp.asarray(corners)
 
 
@@ -177,6 +178,31 @@ def test_random_numbers_are_independent_of_one_another() -> None:
     assert np.abs(off).max() < 5.5 / math.sqrt(frames)
 
 
+def test_scores_tell_right_detections_from_wrong_ones_and_large_from_small() -> None:
+    seen = [Seen(c, (0.5, 0.5, side**2), (0.1, 0.1, 0.9, 0.9)) for c, side in enumerate((1, 0.1))]
+    found = many({"scores": 1.0, "swaps": 0.5}, seen)
+    right, scores = found.classes[:, :2] == np.arange(2), found.boxes[:, :2, 3]
+    small = 1 - math.exp(-1) / 2
+    for i, size in enumerate((1.0, small)):
+        assert scores[right[:, i], i].mean() == pytest.approx(size * 2 / 3, abs=0.01)
+        assert scores[~right[:, i], i].mean() == pytest.approx(size / 3, abs=0.01)
+    half = many({"scores": 0.5}, seen[:1]).boxes[:, 0, 3]
+    assert half.mean() == pytest.approx(0.5 + 0.5 * 2 / 3, abs=0.01)
+
+
+def test_without_noise_all_scores_are_1(some_rooms: SceneTables) -> None:
+    shown = {}
+    for scores in (False, True):
+        spec = dataclasses.replace(SPEC, scores=scores)
+        params = make_params(
+            some_rooms, dict.fromkeys(ROOMS, some_rooms.targets), no_parents(some_rooms), (50,) * 4,
+            spec,
+        )  # fmt: skip
+        shown[scores] = jax.jit(dynamics.reset)(jax.random.key(0), params)[0]
+    np.testing.assert_array_equal(shown[True].boxes[:, 3], shown[True].mask)
+    chex.assert_trees_all_equal(shown[True].replace(boxes=shown[True].boxes[:, :3]), shown[False])
+
+
 def test_jitter_is_a_share_of_the_sides() -> None:
     one = Seen(0, (0.5, 0.5, 0.02), (0.4, 0.45, 0.6, 0.55))  # twice as wide as high
     boxes = many({"jitter": 0.1}, [one]).boxes[:, 0]
@@ -192,7 +218,7 @@ def test_what_lies_in_the_border_is_missed_and_what_reaches_into_it_is_cut() -> 
     )
     found = many({"truncation": 0.1}, [inside, across, outside], frames=2)
     assert found.mask[0, :3].tolist() == [True, True, False]
-    np.testing.assert_allclose(found.boxes[0, 1], (0.2, 0.5, 0.04), atol=1e-6)
+    np.testing.assert_allclose(found.boxes[0, 1], (0.2, 0.5, 0.04, 1), atol=1e-6)
 
 
 def test_a_frame_of_one_row_per_class_keeps_one() -> None:

@@ -89,6 +89,8 @@ FAULTS = (
           "sensors/test_noise.py"),
     Fault("false positives hide what is there", NOISE, "dtype=jnp.int32) - number", "dtype=jnp.int32)",
           "sensors/test_noise.py"),
+    Fault("false positives score high", NOISE, "_scores(~is_false & (", "_scores((",
+          "sensors/test_noise.py"),
     Fault("false positives are swapped", NOISE, "levels.swaps) & ~is_false", "levels.swaps)",
           "sensors/test_noise.py"),
     Fault("a label is swapped for itself", NOISE, "pick + (params.known[pick] >= classes)", "pick",
