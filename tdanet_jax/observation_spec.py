@@ -11,6 +11,9 @@ from typing import Literal
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.registry import SENSORS
 
+#: Sensors that track the target by its boxes.
+_TRACKING = ("triangulation", "robust-triangulation")
+
 
 @dataclasses.dataclass(frozen=True)
 class ObservationSpec:
@@ -52,13 +55,10 @@ class ObservationSpec:
                 raise ValueError(
                     f"--sensors {name}: choose among {', '.join(SENSORS)}, or name a module"
                 )
-        if "triangulation" in self.sensors:
-            before = self.sensors[: self.sensors.index("triangulation")]
-            if "odometry" not in before:
-                raise ValueError("--triangulation: needs --odometry (or use --no-triangulation)")
-        for flag in ("triangulation",) * ("triangulation" in self.sensors) + (
-            "scores",
-        ) * self.scores:
+        tracking = [i for i, name in enumerate(self.sensors) if name in _TRACKING]
+        if tracking and "odometry" not in self.sensors[: tracking[0]]:
+            raise ValueError("--triangulation: needs --odometry (or use --no-triangulation)")
+        for flag in ["triangulation"] * bool(tracking) + ["scores"] * self.scores:
             if self.rows != "object" or self.image is not None:
                 what = model or (f"--image {self.image}" if self.image else f"--rows {self.rows}")
                 raise ValueError(

@@ -133,6 +133,12 @@ def scaled(noise: SenseNoise, factor: float) -> SenseNoise:
     return SenseNoise(**values)
 
 
+def up_to(noise: SenseNoise, factor: float) -> SenseNoise:
+    """Noise whose levels are drawn from 0 to a factor of the given ones, for training."""
+    most = vars(scaled(noise, factor)).items()
+    return SenseNoise(**{name: (0.0, level) for name, level in most if level})
+
+
 def _along(levels: tuple[float, ...], *names: str) -> dict[str, SenseNoise]:
     return {f"{level:g}": SenseNoise(**dict.fromkeys(names, level)) for level in levels}
 

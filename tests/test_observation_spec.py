@@ -23,7 +23,8 @@ BOTH = ("odometry", "triangulation")
     [
         (
             ObservationSpec(sensors=("odometry", "sonar")),
-            "--sensors sonar: choose among odometry, triangulation, or name a module",
+            "--sensors sonar: choose among odometry, triangulation, robust-triangulation, or name "
+            "a module",
         ),
         (
             ObservationSpec(sensors=("triangulation",)),
