@@ -23,7 +23,7 @@ import tyro
 from experiments.console import console, fail, one_line_errors, parse, print_summary, reporter
 from tdanet_jax.config import OWN_TASK, EvalConfig, TrainConfig
 from tdanet_jax.io import files
-from tdanet_jax.sense_noise import SWEEP
+from tdanet_jax.sense_noise import SWEEP, SWEEP_FILE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Command:
     out: Path | None = None
     """Folder to write; must be new or empty. By default <checkpoint>/<policy> for one checkpoint,
     <checkpoint>/history-<policy> for its history, <checkpoint>/noise-<policy> for a sweep over
-    noise, runs/<policy> without one."""
+    noise, runs/<policy> without one. A sweep over noise continues in its folder."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -86,7 +86,10 @@ def main(arguments: list[str] | None = None) -> None:
         kind = f"noise-{command.policy}" if sweep else command.policy
         kind = f"history-{command.policy}" if command.history else kind
         folder = command.out or (*command.checkpoint, Path("runs"))[0] / kind
-        files.check_empty(folder)
+        if sweep and (folder / SWEEP_FILE).is_file():
+            files.check_writable(folder)  # it continues
+        else:
+            files.check_empty(folder)
         if sweep:
             play_noise(command, test, folder)
         else:

@@ -28,9 +28,10 @@ class Command:
     """Trains an agent on the iTHOR training rooms and reports SR and SPL in the test rooms."""
 
     run: tyro.conf.OmitArgPrefixes[TrainConfig]
-    preset: Literal["default", "best", "paper"] = "default"
+    preset: Literal["default", "best", "robust", "paper"] = "default"
     """Defaults of the other flags. best: --odometry, --triangulation, --gamma 0.97 and
-    --size-noise 0.5, which did best on validation. paper: the reference implementation's
+    --size-noise 0.5, which did best on validation. robust: the same with --robust-triangulation,
+    --scores and --noise, for robots, whose senses err. paper: the reference implementation's
     hyperparameters and its budget of 6 M episodes."""
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""

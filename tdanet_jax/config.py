@@ -105,6 +105,11 @@ class NetworkConfig:
     triangulation: bool = False
     """Requires --odometry. Estimates the target's position from the bearings of its past
     detections. Not in the paper; for models that are shown a box of every object."""
+    robust_triangulation: bool = False
+    """Requires --triangulation, and makes it robust to errors of bearings (docs/noise.md)."""
+    scores: bool = False
+    """Show the detector's confidence in each detection, 1 without noise. Not in the paper; for
+    models that are shown a box of every object."""
     sensors: tuple[str, ...] = ()
     """Further sensors: dotted names of custom modules with a function `make` (docs/sensors.md)."""
     inner_rate: float = 1e-4
@@ -119,9 +124,15 @@ class NetworkConfig:
     @property
     def spec(self) -> ObservationSpec:
         """What the flags ask to show the agent; the model decides on rows and image in the end."""
-        flags = {"odometry": self.odometry, "triangulation": self.triangulation}
+        robust = self.robust_triangulation
+        flags = {
+            "odometry": self.odometry,
+            "triangulation": self.triangulation and not robust,
+            "robust-triangulation": self.triangulation and robust,
+        }
         chosen = (*(name for name, on in flags.items() if on), *self.sensors)
-        return ObservationSpec(rows=self.rows, sensors=tuple(dict.fromkeys(chosen)))
+        sensors = tuple(dict.fromkeys(chosen))
+        return ObservationSpec(rows=self.rows, sensors=sensors, scores=self.scores)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,6 +212,8 @@ class TrainConfig:
         if self.network.image == "features" and self.data is None:
             raise ValueError("--image features: needs --data, rooms that were imported with them")
         sense_noise.parse(self.learner.noise)
+        if self.network.robust_triangulation and not self.network.triangulation:
+            raise ValueError("--robust-triangulation: needs --triangulation")
         self.network.spec.check()
 
     def normalised(self) -> TrainConfig:
@@ -448,7 +461,19 @@ BEST = TrainConfig(
     learner=LearnerConfig(gamma=0.97, size_noise=0.5),
     network=NetworkConfig(odometry=True, triangulation=True),
 )
-PRESETS = {"default": TrainConfig(), "best": BEST, "paper": PAPER}
+#: For robots: BEST with senses that err in training, by up to twice the levels of `mix`, and by up
+#: to 3 degrees of heading, which cost more than all else (docs/noise.md).
+ROBUST = dataclasses.replace(
+    BEST,
+    learner=dataclasses.replace(
+        BEST.learner,
+        noise=str(
+            dataclasses.replace(sense_noise.up_to(sense_noise.MIX, 2), heading_error=(0.0, 3.0))
+        ),
+    ),
+    network=dataclasses.replace(BEST.network, robust_triangulation=True, scores=True),
+)
+PRESETS = {"default": TrainConfig(), "best": BEST, "robust": ROBUST, "paper": PAPER}
 
 
 def to_json(config: TrainConfig) -> dict[str, Any]:

@@ -11,6 +11,9 @@ from typing import Literal
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.registry import SENSORS
 
+#: Sensors that track the target by its boxes.
+_TRACKING = ("triangulation", "robust-triangulation")
+
 
 @dataclasses.dataclass(frozen=True)
 class ObservationSpec:
@@ -22,17 +25,24 @@ class ObservationSpec:
       sensors: what it senses in addition to its detections, in the order of the network's inputs:
         names of `SENSORS`, or dotted names of modules of custom sensors.
       grid: the poses that it can take, which sensors must know; networks do not depend on it.
+      scores: whether each box has the detector's confidence in addition, a share.
     """
 
     rows: Literal["object", "class"] = "object"
     image: Literal["raster", "features"] | None = None
     sensors: tuple[str, ...] = ()
     grid: PoseGrid = ITHOR
+    scores: bool = False
+
+    @property
+    def columns(self) -> int:
+        """Numbers of each detection: x and y of the centre, the area S, and the score."""
+        return 3 + self.scores
 
     def agent_name(self, model: str) -> str:
-        """A model's name, and its sensors, which the paper's agents lack: tdanet, --odometry."""
-        flags = (f"--{name}" if name in SENSORS else f"--sensors {name}" for name in self.sensors)
-        return ", ".join([model, *flags])
+        """A model's name, and what it senses unlike the paper's agents: tdanet, --odometry."""
+        flags = [f"--{name}" if name in SENSORS else f"--sensors {name}" for name in self.sensors]
+        return ", ".join([model, *flags, *["--scores"] * self.scores])
 
     def check(self, model: str | None = None) -> None:
         """Raises ValueError, with one line that names the flag, if the parts do not go together.
@@ -45,13 +55,13 @@ class ObservationSpec:
                 raise ValueError(
                     f"--sensors {name}: choose among {', '.join(SENSORS)}, or name a module"
                 )
-        if "triangulation" in self.sensors:
-            before = self.sensors[: self.sensors.index("triangulation")]
-            if "odometry" not in before:
-                raise ValueError("--triangulation: needs --odometry (or use --no-triangulation)")
+        tracking = [i for i, name in enumerate(self.sensors) if name in _TRACKING]
+        if tracking and "odometry" not in self.sensors[: tracking[0]]:
+            raise ValueError("--triangulation: needs --odometry (or use --no-triangulation)")
+        for flag in ["triangulation"] * bool(tracking) + ["scores"] * self.scores:
             if self.rows != "object" or self.image is not None:
                 what = model or (f"--image {self.image}" if self.image else f"--rows {self.rows}")
                 raise ValueError(
-                    f"--triangulation: needs a box of every object, which {what} does not show; "
-                    "use --no-triangulation"
+                    f"--{flag}: needs a box of every object, which {what} does not show; "
+                    f"use --no-{flag}"
                 )

@@ -25,6 +25,7 @@ MODELS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
 SENSORS: Mapping[str, str] = {
     "odometry": "tdanet_jax.sensors.odometry",
     "triangulation": "tdanet_jax.sensors.triangulation",
+    "robust-triangulation": "tdanet_jax.sensors.robust_triangulation",
 }
 
 

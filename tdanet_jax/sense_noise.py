@@ -53,6 +53,9 @@ class SenseNoise:
     truncation: Level = 0.0
     """Width of a border of the image in which the detector sees nothing, as a share of its side.
     Boxes are cut there, and those that lie in it are missed."""
+    scores: Level = 0.0
+    """How uncertain the detector is, for agents that are shown scores: 0 gives 1 to all detections,
+    1 to right ones the larger of two uniform numbers and to wrong ones the smaller."""
     distance_bias: Level = 0.0
     """Share by which an episode's steps all seem longer, or all shorter, with equal probability."""
     distance_noise: Level = 0.0
@@ -104,7 +107,7 @@ def ends(level: Level) -> tuple[float, float]:
 
 NONE = SenseNoise()
 #: A detector as on a robot: a fifth of the detections are missed, small ones more often.
-DETECTOR = SenseNoise(misses=0.15, small_misses=0.3, jitter=0.1, swaps=0.05)
+DETECTOR = SenseNoise(misses=0.15, small_misses=0.3, jitter=0.1, swaps=0.05, scores=1.0)
 #: Wheels that drift: 5 % of each step and turn, the same in an episode, and as much at random.
 WHEELS = SenseNoise(distance_bias=0.05, distance_noise=0.05, turn_bias=0.05, turn_noise=0.05)
 #: Both.
@@ -117,12 +120,23 @@ PRESETS: Mapping[str, SenseNoise] = {
 }  # fmt: skip
 #: `--noise sweep`: every kind of noise below, one after the other.
 SWEEP = "sweep"
+#: The rows of a sweep, written after every level.
+SWEEP_FILE = "noise.json"
 
 
 def scaled(noise: SenseNoise, factor: float) -> SenseNoise:
-    """Noise with every level times a factor."""
-    values = {n: round(factor * ends(level)[1], 9) for n, level in vars(noise).items()}
+    """Noise with every level times a factor, as far as levels go."""
+    values = {
+        n: min(round(factor * ends(level)[1], 9), _MOST.get(n, 1))
+        for n, level in vars(noise).items()
+    }
     return SenseNoise(**values)
+
+
+def up_to(noise: SenseNoise, factor: float) -> SenseNoise:
+    """Noise whose levels are drawn from 0 to a factor of the given ones, for training."""
+    most = vars(scaled(noise, factor)).items()
+    return SenseNoise(**{name: (0.0, level) for name, level in most if level})
 
 
 def _along(levels: tuple[float, ...], *names: str) -> dict[str, SenseNoise]:
@@ -142,6 +156,7 @@ SWEEPS: Mapping[str, Mapping[str, SenseNoise]] = {
     "label swaps": _along((0.02, 0.05, 0.1, 0.2, 0.4), "swaps"),
     "confusions": _along((0.02, 0.05, 0.1, 0.2, 0.4), "confusions"),
     "box jitter": _along((0.05, 0.1, 0.15, 0.2, 0.3), "jitter"),
+    "scores": _along((0.2, 0.4, 0.6, 0.8, 1.0), "scores"),
     "truncation": _along((0.02, 0.05, 0.1, 0.15, 0.2), "truncation"),
     "bias of steps": _along((0.05, 0.1, 0.2, 0.4, 0.6), "distance_bias"),
     "bias of turns": _along((0.02, 0.05, 0.1, 0.2, 0.3), "turn_bias"),

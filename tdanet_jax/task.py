@@ -124,7 +124,7 @@ def make(
     config.check()
     task = load_task(config if split == "train" else dataclasses.replace(config, variants=0))
     # As many rows in training as in tests, so that networks of others can go from one to the other.
-    rows = max(task.train_params.rows, task.eval_params.rows)
+    rows = max(task.train_params.max_detections, task.eval_params.max_detections)
     params = task.train_params if split == "train" else task.eval_params
     params = params.with_rows(rows)
     words = task.train_words if split == "train" else task.words

@@ -57,6 +57,10 @@ def test_paper_preset_has_the_reference_constants():
             "--triangulation: needs --odometry (or use --no-triangulation)",
         ),
         (
+            TrainConfig(network=NetworkConfig(odometry=True, robust_triangulation=True)),
+            "--robust-triangulation: needs --triangulation",
+        ),
+        (
             TrainConfig(network=NetworkConfig(odometry=True, triangulation=True, rows="class")),
             "--triangulation: needs a box of every object, which --rows class does not show",
         ),
@@ -69,6 +73,20 @@ def test_a_value_out_of_range_is_named_in_one_line(config, flag):
     with pytest.raises(ValueError, match=re.escape(flag)) as caught:
         config.check()
     assert "\n" not in str(caught.value)
+
+
+def test_the_robust_preset_is_the_best_with_senses_that_err():
+    noise = (
+        "misses=0:0.3,small_misses=0:0.6,swaps=0:0.1,jitter=0:0.2,scores=0:1,distance_bias=0:0.1,"
+        "distance_noise=0:0.1,turn_bias=0:0.1,turn_noise=0:0.1,heading_error=0:3"
+    )
+    assert configs.PRESETS["robust"].learner.noise == noise
+    assert configs.PRESETS["robust"].network.spec.sensors == ("odometry", "robust-triangulation")
+    changed = {"noise", "robust_triangulation", "scores"}
+    for part in ("learner", "network"):
+        ours, theirs = (vars(getattr(one, part)) for one in (configs.ROBUST, configs.BEST))
+        assert {name for name in ours if ours[name] != theirs[name]} <= changed
+    configs.ROBUST.check()
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5, 2.0])

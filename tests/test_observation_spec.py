@@ -23,7 +23,8 @@ BOTH = ("odometry", "triangulation")
     [
         (
             ObservationSpec(sensors=("odometry", "sonar")),
-            "--sensors sonar: choose among odometry, triangulation, or name a module",
+            "--sensors sonar: choose among odometry, triangulation, robust-triangulation, or name "
+            "a module",
         ),
         (
             ObservationSpec(sensors=("triangulation",)),
@@ -42,6 +43,11 @@ BOTH = ("odometry", "triangulation")
             ObservationSpec(image="features", sensors=BOTH),
             "--triangulation: needs a box of every object, which --image features does not show; "
             "use --no-triangulation",
+        ),
+        (
+            ObservationSpec(rows="class", scores=True),
+            "--scores: needs a box of every object, which --rows class does not show; "
+            "use --no-scores",
         ),
     ],
 )

@@ -286,9 +286,13 @@ class Agent:
             _, found = merge_classes(owner[order], corners[order])
         else:
             owner, found = np.arange(len(labels)), centre_and_area(corners)
+        if self.spec.scores:
+            scores = [1.0 if one.score is None else one.score for one in detections]
+            found = np.column_stack([found, scores])
         count = len(labels)
         rows = max(-(-max(count, least_rows) // ROW_BLOCK), 1) * ROW_BLOCK
-        classes, boxes = np.zeros((1, rows), np.int32), np.zeros((1, rows, 3), np.float32)
+        classes = np.zeros((1, rows), np.int32)
+        boxes = np.zeros((1, rows, found.shape[1]), np.float32)
         classes[0, :count], boxes[0, :count] = labels, found
         observation = Observation(
             classes=jnp.asarray(classes),

@@ -65,7 +65,7 @@ def start(
     bits = _noise_bits(state, params)
     slip = None if bits is None or state.noise is None else noise.slip(bits, state.noise)
     begun = suite.init(params.spec, Start(rotation, horizon, slip))
-    return state.replace(sensors=suite.observe(params.spec, begun, _frame(state, params)))
+    return _look(state.replace(sensors=begun), params, bits)
 
 
 def reset_state(key: jax.Array, params: EnvParams) -> EnvState:
@@ -108,7 +108,7 @@ def reset(key: jax.Array, params: EnvParams) -> tuple[Observation, EnvState]:
 
 def observe(state: EnvState, params: EnvParams) -> Observation:
     """The detections in view, padded to K rows."""
-    frame = _frame(state, params)
+    frame = _frame(state, params) if state.frame is None else state.frame
     features = None
     if params.features is not None and params.first_feature is not None:
         position, *view = params.grid.split(state.pose)
@@ -132,8 +132,21 @@ def _noise_bits(state: EnvState, params: EnvParams) -> jax.Array | None:
     return noise.draw(state.noise, state.steps, params.max_detections)
 
 
+def _look(state: EnvState, params: EnvParams, bits: jax.Array | None) -> EnvState:
+    """The state once the sensors have observed the frame; it keeps a frame that senses got wrong.
+
+    Args:
+      bits: of the step, if senses err.
+    """
+    frame = _frame(state, params)
+    if bits is not None:
+        frame = _noisy(frame, state, params, bits)
+        state = state.replace(frame=frame)
+    return state.replace(sensors=suite.observe(params.spec, state.sensors, frame))
+
+
 def _frame(state: EnvState, params: EnvParams) -> Frame:
-    """The detections that the agent is shown, padded with zeros."""
+    """The detections in view, padded with zeros."""
     target = params.target_class[state.target]
     first, last = params.row_start[state.pose], params.row_start[state.pose + 1]
     longest = params.max_detections
@@ -147,16 +160,21 @@ def _frame(state: EnvState, params: EnvParams) -> Frame:
         is_target = classes == target
         area = jnp.minimum(boxes[:, 2] * jnp.where(is_target, state.area_factor, 1.0), 1.0)
         boxes = boxes.at[:, 2].set(area)
-    classes = jnp.where(mask, classes, 0)
-    bits = _noise_bits(state, params)
-    if bits is not None and params.noise is not None and state.noise is not None:
-        flat = params.noise.corners.reshape(-1)
-        corners = jax.lax.dynamic_slice(flat, (4 * first,), (4 * longest,)).reshape(longest, 4)
-        seen = Detections(classes, boxes, mask)
-        classes, boxes, mask = noise.detect(
-            seen, corners, bits, state.noise, params.noise, params.row_class
-        )
-    return Frame(classes, boxes, mask, target)
+    if params.spec.scores:
+        boxes = jnp.concatenate([boxes, mask[:, None].astype(jnp.float32)], axis=1)
+    return Frame(jnp.where(mask, classes, 0), boxes, mask, target)
+
+
+def _noisy(frame: Frame, state: EnvState, params: EnvParams, bits: jax.Array) -> Frame:
+    """What senses that err make of a frame."""
+    assert params.noise is not None
+    assert state.noise is not None
+    longest, first = params.max_detections, params.row_start[state.pose]
+    flat = params.noise.corners.reshape(-1)
+    corners = jax.lax.dynamic_slice(flat, (4 * first,), (4 * longest,)).reshape(longest, 4)
+    seen = Detections(frame.classes, frame.boxes, frame.mask)
+    found = noise.detect(seen, corners, bits, state.noise, params.noise, params.row_class)
+    return Frame(*found, frame.target)
 
 
 def is_visible(pose: jax.Array, cls: jax.Array, params: EnvParams) -> jax.Array:
@@ -199,9 +217,8 @@ def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome
     limit = params.step_limit[room.astype(jnp.int32)]
     after = seen.replace(pose=pose, steps=steps)
     moved = suite.update(params.spec, after.sensors, Motion(action, pose == state.pose, slip))
-    after = after.replace(sensors=suite.observe(params.spec, moved, _frame(after, params)))
     return Outcome(
-        state=after,
+        state=_look(after.replace(sensors=moved), params, bits),
         reward=reward.astype(jnp.float32),
         terminated=done,
         truncated=~done & (steps >= limit),

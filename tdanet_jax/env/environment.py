@@ -42,11 +42,12 @@ class Environment:
 
     def observation_space(self, params: EnvParams | None = None) -> Dict:
         """The fields of `Observation` that every environment has."""
-        rows = (params or self.default_params).rows
+        params = params or self.default_params
+        rows = params.max_detections
         return Dict(
             {
                 "classes": Box(0, len(self.class_names) - 1, (rows,), jnp.int32),
-                "boxes": Box(0.0, 1.0, (rows, 3)),
+                "boxes": Box(0.0, 1.0, (rows, params.spec.columns)),
                 "mask": Box(0, 1, (rows,), bool),
                 "target": Discrete(len(self.class_names)),
             }
@@ -73,8 +74,8 @@ class FlatObservations:
     """An environment whose observations are vectors [size] float32, with word vectors filled in.
 
     For networks of others, which know nothing of classes. In this order: for each of the K rows, 1
-    (0 in padding), x, y, S and the word vector of its class; the word vector of the target; and
-    the features of the sensors, if there are any.
+    (0 in padding), x, y, S, its score if scores are shown, and the word vector of its class; the
+    word vector of the target; and the features of the sensors, if there are any.
 
     Attributes:
       env: what `tdanet_jax.make` gives.
@@ -105,7 +106,7 @@ class FlatObservations:
         """Vectors of the size that `params` give; the same in training and in tests."""
         params = params or self.default_params
         width = self.env.words.shape[1]
-        size = params.rows * (4 + width) + width
+        size = params.max_detections * (1 + params.spec.columns + width) + width
         if params.spec.sensors:
             size += suite.width(params.spec)
         return Box(-jnp.inf, jnp.inf, (size,))

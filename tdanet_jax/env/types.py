@@ -15,7 +15,8 @@ from flax import struct
 
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.poses import PoseGrid
-from tdanet_jax.sensors.noise import SPARE, EpisodeNoise, NoiseParams
+from tdanet_jax.sensors.noise import EpisodeNoise, NoiseParams
+from tdanet_jax.sensors.sensor import Frame
 
 #: Rows and columns of the class raster, the size of a ResNet-18 feature map.
 RASTER = (7, 7)
@@ -58,14 +59,9 @@ class EnvParams(struct.PyTreeNode):
         """The poses at a position."""
         return self.spec.grid
 
-    @property
-    def rows(self) -> int:
-        """Rows of detections in an observation."""
-        return self.max_detections + (0 if self.noise is None else SPARE)
-
     def with_rows(self, rows: int) -> EnvParams:
         """The same with so many rows in an observation, at least as many as now."""
-        more = rows - self.rows  # rows of padding, also after the last pose
+        more = rows - self.max_detections  # rows of padding, also after the last pose
         noise = self.noise
         if noise is not None:
             noise = noise.replace(corners=jnp.pad(noise.corners, ((0, more), (0, 0))))
@@ -73,7 +69,7 @@ class EnvParams(struct.PyTreeNode):
             row_class=jnp.pad(self.row_class, (0, more)),
             row_box=jnp.pad(self.row_box, ((0, more), (0, 0))),
             noise=noise,
-            max_detections=self.max_detections + more,
+            max_detections=rows,
         )
 
 
@@ -90,16 +86,17 @@ class EnvState(struct.PyTreeNode):
     room: jax.Array | None = None  # int8, room type of the start, if there are houses
     sensors: Mapping[str, Any] = struct.field(default_factory=dict)  # states of the sensors by name
     noise: EpisodeNoise | None = None  # of senses that err
+    frame: Frame | None = None  # what they show
 
 
 class Observation(struct.PyTreeNode):
     """What the agent perceives. A frame without detections is one all-zero row.
 
-    With noise, K is larger by `tdanet_jax.sensors.noise.SPARE`, and padding lies anywhere.
+    With noise, padding lies anywhere.
     """
 
     classes: jax.Array  # [K] int32, class of each detection; 0 in padding
-    boxes: jax.Array  # [K, 3] float32, x, y, S
+    boxes: jax.Array  # [K, 3] float32, x, y, S; [K, 4] with the score, if it is shown
     mask: jax.Array  # [K] bool, False in padding
     target: jax.Array  # int32, class of the target
     empty: jax.Array  # bool, no detection at all

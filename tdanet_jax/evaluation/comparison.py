@@ -25,8 +25,8 @@ Result = Mapping[str, Any]
 Columns = Mapping[str, Mapping[str, np.ndarray]]
 #: What learning curves show.
 MEASURES = ("SR", "SPL")
-#: Flags of sensors, which the paper's agents do not have.
-BEYOND = ("--odometry", "--triangulation", "--sensors")
+#: Flags of what the paper's agents do not sense.
+BEYOND = ("--odometry", "--triangulation", "--robust-triangulation", "--scores", "--sensors")
 #: Flags that do not change the trained agent: the seed, and logging or checkpoint intervals.
 NOT_SETTINGS = ("--seed", "--chunk-updates", "--checkpoint-minutes", "--history", "--max-skipped")
 

@@ -29,7 +29,6 @@ from tdanet_jax.evaluation.rollout import Records
 from tdanet_jax.io import files
 from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.observation_spec import ObservationSpec
-from tdanet_jax.registry import SENSORS
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.splits import GROUPS, in_order, is_open
 from tdanet_jax.targets import PAPER
@@ -42,6 +41,8 @@ Played = Mapping[str, tuple[Episodes, Records]]
 Columns = Mapping[str, np.ndarray]
 
 RESULTS_VERSION = 1
+#: Sensors with a field of their own in `results.json`, from before there was a list of all.
+FLAGS = ("odometry", "triangulation")
 #: What an evaluation writes into its folder; `RESULTS_FILE` comes last.
 RESULTS_FILE, RESULTS_PAGE, EPISODES_FILE = "results.json", "results.md", "episodes.jsonl"
 
@@ -164,7 +165,7 @@ def _results(
         }
 
     origin = dataclasses.asdict(provenance)
-    origin |= {name: name in provenance.sensors for name in SENSORS}
+    origin |= {name: name in provenance.sensors for name in FLAGS}
     origin["sensors"] = list(provenance.sensors)
     return {
         "version": RESULTS_VERSION,

@@ -46,20 +46,20 @@ def check(path: Path, results: Any) -> None:
     for name in ("data", "targets"):
         if not isinstance(results.get(name), str | None):
             raise FileError(path, f"{name} is not text")
-    _check_groups(path, results, "")
+    check_groups(path, results, "")
     if results.get("seen") is None:
         raise FileError(path, "not the results of a run (no results for seen targets)")
     rooms = results.get("by_room")
     if not isinstance(rooms, dict):
         raise FileError(path, "by_room is not an object")
     for room, groups in rooms.items():
-        _check_groups(path, groups, f"by_room, {room}, ")
+        check_groups(path, groups, f"by_room, {room}, ")
 
 
-def _check_groups(path: Path, groups: Any, where: str) -> None:
+def check_groups(path: Path, groups: Any, where: str) -> None:
     """Checks the results by group: measures and number of episodes, intervals if there are."""
     if not isinstance(groups, Mapping):
-        raise FileError(path, f"{where}: not an object")
+        raise FileError(path, f"{where.rstrip(', ')}: not an object")
     for group in GROUPS:
         buckets = groups.get(group)
         for bucket in BUCKETS if buckets is not None else ():

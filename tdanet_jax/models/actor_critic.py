@@ -142,7 +142,7 @@ class ActorCritic(nn.Module):
         """Observations without any detection."""
         return Observation(
             classes=jnp.zeros((batch, 1), jnp.int32),
-            boxes=jnp.zeros((batch, 1, 3)),
+            boxes=jnp.zeros((batch, 1, self.spec.columns)),
             mask=jnp.zeros((batch, 1), bool),
             target=jnp.zeros(batch, jnp.int32),
             empty=jnp.ones(batch, bool),

@@ -28,8 +28,8 @@ from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import Linear, look_up, look_up_in_rows
 
-#: Centre and area in the target's row, before its word vector.
-TARGET_BOX = (0.5, 0.5, 0.25)
+#: Centre, area and score in the target's row, before its word vector.
+TARGET_BOX = (0.5, 0.5, 0.25, 1.0)
 
 
 class ClassTable(struct.PyTreeNode):
@@ -37,7 +37,7 @@ class ClassTable(struct.PyTreeNode):
 
     words: jax.Array  # [C, D], word vector of each class
     class_logits: jax.Array  # [C_t, C], attention logit of a class's word vector
-    box_logits: jax.Array  # [C_t, 3], attention logit of a unit of x, y and S
+    box_logits: jax.Array  # [C_t, F], attention logit of a unit of x, y, S and the score
     reference: jax.Array  # [C_t, H], the target's branch of the Siamese comparison
 
 
@@ -51,12 +51,14 @@ class TDANetEncoder(Encoder):
       siamese: False replaces SA by the attended feature alone (Table IV). With neither, nothing
         would depend on the target, so its word vector is appended to the features.
       dtype: operands of the products; parameters and sums stay float32.
+      columns: F, numbers of each detection: 3, or 4 with scores.
     """
 
     width: int = 512
     target_attention: bool = True
     siamese: bool = True
     dtype: Any = jnp.float32
+    columns: int = 3
 
     @property
     def dropout_units(self) -> int:
@@ -74,16 +76,16 @@ class TDANetEncoder(Encoder):
     def prepare(self, words: jax.Array) -> ClassTable:
         """Everything that depends on class names alone, from their word vectors [C, D]."""
         chex.assert_rank(words, 2)
-        count = words.shape[0]
-        box = jnp.broadcast_to(jnp.asarray(TARGET_BOX, words.dtype), (count, 3))
-        targets = jnp.concatenate([box, words], axis=-1)  # [C, 3 + D]
-        class_logits, box_logits = jnp.zeros((count, count)), jnp.zeros((count, 3))
+        count, columns = words.shape[0], self.columns
+        box = jnp.broadcast_to(jnp.asarray(TARGET_BOX[:columns], words.dtype), (count, columns))
+        targets = jnp.concatenate([box, words], axis=-1)  # [C, F + D]
+        class_logits, box_logits = jnp.zeros((count, count)), jnp.zeros((count, columns))
         if self.target_attention:
             queries = self.attention(targets)  # [C, H]
             # W_L of a row is the sum over its parts, and so are the logits.
-            bias = self.attention(jnp.zeros((1, words.shape[1] + 3)))
-            units = self.attention(jnp.eye(3, words.shape[1] + 3)) - bias  # [3, H]
-            names = self.attention(jnp.pad(words, ((0, 0), (3, 0))))  # [C, H], bias included
+            bias = self.attention(jnp.zeros((1, words.shape[1] + columns)))
+            units = self.attention(jnp.eye(columns, words.shape[1] + columns)) - bias  # [F, H]
+            names = self.attention(jnp.pad(words, ((0, 0), (columns, 0))))  # [C, H], bias included
             class_logits, box_logits = queries @ names.T, queries @ units.T
         return ClassTable(words, class_logits, box_logits, self.branch(targets))
 
@@ -145,6 +147,7 @@ def make(
         target_attention=target_attention,
         siamese=siamese,
         dtype=dtype,
+        columns=config.spec.columns,
     )
     return ActorCritic(encoder, hidden=config.hidden, dtype=dtype)
 

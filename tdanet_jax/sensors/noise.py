@@ -1,11 +1,11 @@
 """Senses that err: detections and motion as an agent perceives them, from those of the world.
 
-A frame is a pure function of the episode's key, the number of the step and the pose: whoever looks
-twice sees the same. Levels are arrays, so that one compiled program serves them all. Random numbers
-are fields of 16 bits of one draw per step, a column for each detection and a last one for the
-motion that led to the step.
+A frame is a pure function of the episode's key, the number of the step and the pose. Levels are
+arrays, so that one compiled program serves them all. Random numbers are fields of 16 bits of one
+draw per step: a column for each row of a frame, one for each extra detection, and a last one for
+the motion that led to the step.
 
-Axes: K detections of the tables, R = K + SPARE rows of a noisy frame, A known classes.
+Axes: K rows of a frame, with or without noise, A known classes.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from flax import struct
 from tdanet_jax.sense_noise import SenseNoise, ends
 from tdanet_jax.sensors.sensor import Slip
 
-#: Rows at the end of a frame: first for duplicates, then for false positives.
-DUPLICATES, FALSE_POSITIVES = 4, 4
-SPARE = DUPLICATES + FALSE_POSITIVES
+#: Rows after those in view that false positives and duplicates can fill.
+EXTRA = 4
 #: Side of a box, as a share of the image's, at which misses of small boxes have fallen to 1/e.
 SMALL_SIDE = 0.1
 #: Classes that a class can be confused with.
@@ -40,8 +39,10 @@ LOOKALIKES = (
     ("Microwave", "Toaster"), ("GarbageCan", "LaundryHamper"),
 )  # fmt: skip
 
-#: Fields of a detection's column of random bits.
-_MISS, _CHANGE, _CLASS, _X, _Y, _WIDTH, _HEIGHT, _EXTRA = range(8)
+#: Fields of a row's column of random bits.
+_MISS, _CHANGE, _CLASS, _X, _Y, _WIDTH, _HEIGHT, _SCORE = range(8)
+#: Fields of an extra detection's column; the last two are one number of 32 bits.
+_FALSE, _AGAIN, _COPIED, _STRANGE, _STRANGE_LOW = range(5)
 #: Fields of the motion's column.
 _STEP, _TURN, _ERROR, _SHORT, _LENGTH, _FAIL = range(6)
 
@@ -57,6 +58,7 @@ class NoiseLevels(NamedTuple):
     confusions: jax.Array
     jitter: jax.Array
     truncation: jax.Array
+    scores: jax.Array
     distance_bias: jax.Array
     distance_noise: jax.Array
     turn_bias: jax.Array
@@ -76,8 +78,8 @@ _SIGNED = np.array(
 class NoiseParams(struct.PyTreeNode):
     """What the environment needs for senses that err; part of `EnvParams`."""
 
-    low: jax.Array  # [16] float32, least levels of an episode, in the order of `NoiseLevels`
-    high: jax.Array  # [16] float32, greatest levels
+    low: jax.Array  # [17] float32, least levels of an episode, in the order of `NoiseLevels`
+    high: jax.Array  # [17] float32, greatest levels
     corners: jax.Array  # [N + K, 4] float32, x1, y1, x2, y2 of each detection's extent
     known: jax.Array  # [A] int32, ascending: the classes that are detected anywhere
     similar: jax.Array  # [C, SIMILAR] int32, what a class is confused with
@@ -89,15 +91,15 @@ class EpisodeNoise(struct.PyTreeNode):
     """The noise of one episode; part of `EnvState`."""
 
     key: jax.Array  # [2] uint32, data of the episode's key
-    levels: jax.Array  # [16] float32, in the order of `NoiseLevels`
+    levels: jax.Array  # [17] float32, in the order of `NoiseLevels`
 
 
 class Detections(NamedTuple):
     """The rows of a frame."""
 
-    classes: jax.Array  # [R] int32
-    boxes: jax.Array  # [R, 3] float32
-    mask: jax.Array  # [R] bool
+    classes: jax.Array  # [K] int32
+    boxes: jax.Array  # [K, 3] float32, or [K, 4] with scores
+    mask: jax.Array  # [K] bool
 
 
 def make_params(
@@ -157,20 +159,34 @@ def begin(key: jax.Array, params: NoiseParams) -> EpisodeNoise:
     return EpisodeNoise(key=jax.random.key_data(own), levels=sign * level)
 
 
-def draw(noise: EpisodeNoise, step: jax.Array, detections: int) -> jax.Array:
-    """The random bits of a step, [8, detections + SPARE + 1] uint16."""
+def draw(noise: EpisodeNoise, step: jax.Array, rows: int) -> jax.Array:
+    """The random bits of a step, [8, rows + EXTRA + 1] uint16.
+
+    JAX's own numbers of the step's key are mixed with a counter: 300 of them for each frame would
+    take more time than all else in a frame.
+    """
     key = jax.random.fold_in(jax.random.wrap_key_data(noise.key), step)
-    return jax.random.bits(key, (8, detections + SPARE + 1), jnp.uint16)
+    first, second = jax.random.key_data(key)
+    counter = jnp.arange(4 * (rows + EXTRA + 1), dtype=jnp.uint32).reshape(4, -1)
+    words = _mixed(_mixed(counter + first) ^ second)
+    return jnp.concatenate([words, words >> 16]).astype(jnp.uint16)
+
+
+def _mixed(words: jax.Array) -> jax.Array:
+    """Words of 32 bits whose every bit depends on all bits of the given ones: MurmurHash3's end."""
+    words = (words ^ words >> 16) * jnp.uint32(0x85EBCA6B)
+    words = (words ^ words >> 13) * jnp.uint32(0xC2B2AE35)
+    return words ^ words >> 16
 
 
 def detect(
     seen: Detections, corners: jax.Array, bits: jax.Array, noise: EpisodeNoise,
     params: NoiseParams, row_class: jax.Array,
 ) -> Detections:  # fmt: skip
-    """What a detector makes of the K detections in view: R rows, the padding zero.
+    """What a detector makes of the detections in view: K rows, the padding zero.
 
     Args:
-      seen: the detections in view, [K].
+      seen: the detections in view, the first of K rows.
       corners: [K, 4], their extents.
       bits: of the step (`draw`).
       noise: of the episode.
@@ -179,38 +195,44 @@ def detect(
     """
     levels = NoiseLevels(*noise.levels)
     count = seen.mask.shape[0]
-    # Duplicates copy rows that are there; false positives those of any view. The rest stays.
     number = jnp.sum(seen.mask, dtype=jnp.int32)
-    spare = bits[_EXTRA, count : count + SPARE]
-    copied = jnp.minimum(_index(spare[:DUPLICATES], number), count - 1)
-    strange = _wide_index(spare[DUPLICATES:], bits[_CLASS, count + DUPLICATES : -1], params.rows)
-    box_of_strange = params.corners[strange]
-    x1, y1, x2, y2 = box_of_strange.T
-    strange_box = jnp.stack([(x1 + x2) / 2, (y1 + y2) / 2, (x2 - x1) * (y2 - y1)], axis=-1)
-    classes = jnp.concatenate([seen.classes, seen.classes[copied], row_class[strange]])
-    boxes = jnp.concatenate([seen.boxes, seen.boxes[copied], strange_box])
-    corners = jnp.concatenate([corners, corners[copied], box_of_strange])
-    bits = bits[:, :-1]
-    chance = _uniform(bits[_MISS])
-    side = jnp.sqrt(boxes[:count, 2])
+    own, extra = bits[:, :count], bits[:, count : count + EXTRA]
+    side = jnp.sqrt(seen.boxes[:, 2])
     shown = (1 - levels.misses) * (1 - levels.small_misses * jnp.exp(-side / SMALL_SIDE))
-    there = seen.mask & (chance[:count] >= 1 - shown)
-    again, false = chance[count : count + DUPLICATES], chance[count + DUPLICATES :]
-    mask = jnp.concatenate(
-        [
-            there,
-            there[copied] & (again < levels.duplicates * number / DUPLICATES),
-            false < levels.false_positives / FALSE_POSITIVES,
-        ]
-    )
-    is_false = jnp.arange(len(mask)) >= count + DUPLICATES
-    classes = _labels(classes, bits, levels, params, is_false)
-    boxes, visible = _boxes(boxes, corners, bits, levels)
+    there = seen.mask & (_uniform(own[_MISS]) >= 1 - shown)
+
+    # The rows after those in view: false positives are those of any view, duplicates copy rows that
+    # are there.
+    false = _uniform(extra[_FALSE]) < levels.false_positives / EXTRA
+    copied = jnp.minimum(_index(extra[_COPIED], number), count - 1)
+    again = (_uniform(extra[_AGAIN]) < levels.duplicates * number / EXTRA) & there[copied]
+    strange = _wide_index(extra[_STRANGE], extra[_STRANGE_LOW], params.rows)
+    x1, y1, x2, y2 = params.corners[strange].T
+    strange_box = jnp.stack([(x1 + x2) / 2, (y1 + y2) / 2, (x2 - x1) * (y2 - y1)], axis=-1)
+    after = jnp.arange(count, dtype=jnp.int32) - number
+
+    def place(rows: jax.Array, copies: jax.Array, others: jax.Array) -> jax.Array:
+        """The rows with the extra ones after those in view, as far as there is room."""
+        for i in range(EXTRA):
+            one = jnp.where(false[i], others[i], copies[i])
+            rows = jnp.where((after == i).reshape(-1, *[1] * one.ndim), one, rows)
+        return rows
+
+    classes = place(seen.classes, seen.classes[copied], row_class[strange])
+    boxes = place(seen.boxes[:, :3], seen.boxes[copied, :3], strange_box)
+    corners = place(corners, corners[copied], params.corners[strange])
+    mask = place(there, again, jnp.ones_like(false))
+    is_false = place(jnp.zeros_like(there), jnp.zeros_like(false), jnp.ones_like(false))
+    labels = _labels(classes, own, levels, params, is_false)
+    scores = _scores(~is_false & (labels == classes), boxes, own, levels)
+    boxes, visible = _boxes(boxes, corners, own, levels)
     mask &= visible
+    if seen.boxes.shape[1] > 3:
+        boxes = jnp.concatenate([boxes, scores], axis=1)
     if params.one_per_class:
-        earlier = jnp.tril(jnp.ones((len(mask), len(mask)), bool), -1)
-        mask &= ~jnp.any(earlier & mask & (classes == classes[:, None]), axis=1)
-    return Detections(jnp.where(mask, classes, 0), jnp.where(mask[:, None], boxes, 0.0), mask)
+        earlier = jnp.tril(jnp.ones((count, count), bool), -1)
+        mask &= ~jnp.any(earlier & mask & (labels == labels[:, None]), axis=1)
+    return Detections(jnp.where(mask, labels, 0), jnp.where(mask[:, None], boxes, 0.0), mask)
 
 
 def _labels(
@@ -228,6 +250,15 @@ def _labels(
     other = params.known[jnp.minimum(at, params.known.shape[0] - 1)]
     alike = params.similar[classes, (bits[_CLASS] >> 14).astype(jnp.int32)]
     return jnp.where(swap, other, jnp.where(confuse, alike, classes))
+
+
+def _scores(right: jax.Array, boxes: jax.Array, bits: jax.Array, levels: NoiseLevels) -> jax.Array:
+    """The detector's confidence in each row, [K, 1]."""
+    one, other = bits[_SCORE] >> 8, bits[_SCORE] & 255
+    drawn = jnp.where(right, jnp.maximum(one, other), jnp.minimum(one, other))
+    of_size = 1 - jnp.exp(-jnp.sqrt(boxes[:, 2]) / SMALL_SIDE) / 2
+    sure = drawn.astype(jnp.float32) * jnp.float32(2.0**-8) * of_size
+    return (1 - levels.scores * (1 - sure))[:, None]
 
 
 def _boxes(

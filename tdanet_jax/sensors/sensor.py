@@ -59,7 +59,8 @@ class Frame(NamedTuple):
     """The detections in view."""
 
     classes: jax.Array  # [K] int32, 0 in padding
-    boxes: jax.Array  # [K, 3] float32, x, y, S: box centre and area as shares of the image
+    boxes: jax.Array  # [K, 3] float32, x, y, S: box centre and area as shares of the image; or
+    # [K, 4] with the detector's score, if the agent is shown scores
     mask: jax.Array  # [K] bool, False in padding
     target: jax.Array  # int32, class of the target
 

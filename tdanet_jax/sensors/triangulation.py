@@ -72,7 +72,7 @@ class Triangulation(Sensor):
         x, z = cells * self.grid.grid_size
         moved = jnp.stack([x, jnp.zeros_like(x), z])
         return state.replace(
-            moment=state.moment - _dot(state.normal, moved),
+            moment=state.moment - dot(state.normal, moved),
             moved=state.moved | jnp.any(cells != 0),
         )
 
@@ -91,22 +91,30 @@ class Triangulation(Sensor):
         rays = _rays(self.grid, boxes, angle, others["odometry"].horizon)
         lengths = jnp.linalg.norm(rays, axis=-1)
         directions = rays / lengths[:, None]
-        cosine = _dot(directions, _direction(_solve(state)[0]))
+        cosine = dot(directions, direction_of(solve(state)[0]))
         nearest = jnp.argmax(jnp.where(is_target, cosine, -2.0))
         largest = jnp.argmax(jnp.where(is_target, boxes[:, 2], -1.0))
-        more = _add(state, directions[nearest], state.moved)
-        agrees = _dot(directions[nearest], _direction(_solve(more)[0])) > SAME_OBJECT_COSINE
+        more = self.add(state, directions[nearest], state.moved)
+        agrees = dot(directions[nearest], direction_of(solve(more)[0])) > SAME_OBJECT_COSINE
         same = _any_ray(state) & agrees
         prior = no_estimate().replace(
             normal=PRIOR_WEIGHT * jnp.eye(3),
             moment=PRIOR_WEIGHT * VISIBILITY_DISTANCE * directions[largest],
         )
-        seen = _choose(same, more, _add(prior, directions[largest], True))
+        seen = _choose(same, more, self.add(prior, directions[largest], True))
         chosen = jnp.where(same, nearest, largest)
         # At a depth of one metre, the image is two metres wide.
-        depth = jnp.linalg.norm(_solve(seen)[0]) / lengths[chosen]
+        depth = jnp.linalg.norm(solve(seen)[0]) / lengths[chosen]
         radius = jnp.minimum(jnp.sqrt(boxes[chosen, 2]) * depth, MAX_RADIUS)
         return _choose(jnp.any(is_target), seen.replace(radius=radius), state)
+
+    def add(
+        self, estimate: TargetEstimate, direction: jax.Array, counts: jax.Array | bool
+    ) -> TargetEstimate:
+        """The estimate with one more ray from where the agent is, if `counts`."""
+        across = jnp.eye(3) - direction[:, None] * direction
+        normal = estimate.normal + jnp.where(counts, across, 0.0)
+        return estimate.replace(normal=normal, moved=jnp.zeros((), bool))
 
     def clear(self, state: TargetEstimate, changed: jax.Array) -> TargetEstimate:
         """No estimate of another target."""
@@ -120,7 +128,7 @@ class Triangulation(Sensor):
         centre and its near side are within 1.5 m horizontally, in units of 0.25 m, from -1 to 1;
         and these two times the certainty.
         """
-        position, weight = _solve(state)
+        position, weight = solve(state)
         angle = odometry.believed_angle(self.grid, others["odometry"])
         sine, cosine = jnp.sin(angle), jnp.cos(angle)
         x, y, z = position
@@ -148,25 +156,17 @@ def _any_ray(estimate: TargetEstimate) -> jax.Array:
     return estimate.normal[0, 0] > 0
 
 
-def _add(
-    estimate: TargetEstimate, direction: jax.Array, counts: jax.Array | bool
-) -> TargetEstimate:
-    """The estimate with one more ray from where the agent is, if `counts`."""
-    across = jnp.eye(3) - direction[:, None] * direction
-    normal = estimate.normal + jnp.where(counts, across, 0.0)
-    return estimate.replace(normal=normal, moved=jnp.zeros((), bool))
-
-
 def _choose(chosen: jax.Array, one: TargetEstimate, other: TargetEstimate) -> TargetEstimate:
     return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), one, other)
 
 
-def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
+def dot(a: jax.Array, b: jax.Array) -> jax.Array:
     """Scalar products along the last axis, in full precision: a GPU rounds `@`."""
     return jnp.sum(a * b, axis=-1)
 
 
-def _direction(position: jax.Array) -> jax.Array:
+def direction_of(position: jax.Array) -> jax.Array:
+    """The unit vector towards a position [3]."""
     return position / jnp.maximum(jnp.linalg.norm(position), 1e-6)
 
 
@@ -182,11 +182,11 @@ def _rays(grid: PoseGrid, boxes: jax.Array, angle: jax.Array, horizon: jax.Array
     return jnp.stack([right * cosine + ahead * sine, up, ahead * cosine - right * sine], axis=-1)
 
 
-def _solve(estimate: TargetEstimate) -> tuple[jax.Array, jax.Array]:
+def solve(estimate: TargetEstimate) -> tuple[jax.Array, jax.Array]:
     """The position [3], and the weight of the evidence along the line of sight."""
     a, b, c = estimate.normal
     adjugate = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])  # symmetric
-    inverse = adjugate / jnp.maximum(_dot(a, adjugate[0]), 1e-12)
-    position = _dot(inverse, estimate.moment)
-    direction = _direction(position)
-    return position, 1 / jnp.maximum(_dot(direction, _dot(inverse, direction)), 1e-6)
+    inverse = adjugate / jnp.maximum(dot(a, adjugate[0]), 1e-12)
+    position = dot(inverse, estimate.moment)
+    direction = direction_of(position)
+    return position, 1 / jnp.maximum(dot(direction, dot(inverse, direction)), 1e-6)

@@ -178,7 +178,7 @@ def tdanet_forward_macs(model: ActorCritic, words_width: int) -> int:
     """
 
     width, hidden = model.encoder.width, model.hidden
-    encoder = (3 + words_width) * width + 3 * width * width
+    encoder = (model.spec.columns + words_width) * width + 3 * width * width
     action = NUM_ACTIONS * model.action_width
     sensors = SENSOR_UNITS if model.spec.sensors else 0
     lstm = (width + sensors + model.action_width + hidden) * 4 * hidden

@@ -1,23 +1,33 @@
-"""Evaluation with senses that err: agents at five levels of each kind of noise, and the report."""
+"""Evaluation with senses that err: agents at five levels of each kind of noise, and the report.
+
+A sweep takes about an hour for each agent. `noise.json` is written after every level, and a sweep
+that was stopped continues with those that it does not hold.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from tdanet_jax import sense_noise
 from tdanet_jax.analysis import figures
 from tdanet_jax.config import OWN_TASK, EvalConfig, describe_departures
-from tdanet_jax.evaluation import metrics, report, saved_networks
+from tdanet_jax.evaluation import metrics, report, results_file, saved_networks
 from tdanet_jax.evaluation.metrics import MEASURES
+from tdanet_jax.evaluation.saved_networks import SavedNetwork
 from tdanet_jax.io import files
 from tdanet_jax.io.escaping import in_markdown
+from tdanet_jax.io.untrusted import FileError, jsons
+from tdanet_jax.sense_noise import SWEEP_FILE
 from tdanet_jax.splits import GROUPS
+from tdanet_jax.training.history import Snapshot
 from tdanet_jax.workflows.evaluate import short_names
 
+Row = dict[str, Any]
 #: The kind, the level's name and the noise of everything that a sweep plays; first without noise.
 PLAN = [
     (None, "0", sense_noise.NONE),
@@ -34,7 +44,7 @@ def evaluate_noise(
     out: Path | str | None = None,
     on_network: Callable[[float, str], None] | None = None,
     plan: Sequence[tuple[str | None, str, sense_noise.SenseNoise]] = PLAN,
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """Plays the fixed test episodes with each agent at each level of each kind of noise.
 
     All levels are played by one compiled program for each shape of network.
@@ -44,8 +54,10 @@ def evaluate_noise(
       policy: "sample" or "greedy", how actions are chosen.
       test: where the evaluation departs from the runs' own task; without noise.
       seed: of sampled actions; by default each run's own.
-      out: folder for `noise.json`, `noise.md` and `noise.png`; None writes nothing.
-      on_network: called with the share that is done, and what was played last.
+      out: folder for `noise.json`, `noise.md` and `noise.png`; None writes nothing. Levels that its
+        `noise.json` holds are not played again.
+      on_network: called with the share that is done, and what was played last; first with the share
+        that is there.
       plan: kind, name of the level and noise; the first without noise.
 
     Returns:
@@ -54,46 +66,140 @@ def evaluate_noise(
       differences from the same agent without noise (None for itself).
 
     Raises:
-      ValueError: a folder holds no run, or its network cannot be read.
+      ValueError: a folder holds no run, its network cannot be read, or `noise.json` is not of the
+        same agents, episodes, rooms and seed.
+      BlockingIOError: another process writes to the folder.
     """
     test.check()
-    names = short_names(checkpoints)
-    networks = {
-        (run, i): dataclasses.replace(
-            saved_networks.find(run, test=test)[0],
-            test=dataclasses.replace(test, noise=str(noise)),
-        )
-        for run in names
-        for i, (*_, noise) in enumerate(plan)
-    }
-    rows: dict[tuple[Path, int], dict[str, Any]] = {}
-    clean: dict[Path, Mapping[str, report.Columns]] = {}
+    folder = None if out is None else Path(out)
+    with contextlib.nullcontext() if folder is None else files.locked(folder):
+        if folder is not None:
+            files.remove_partial(folder)
+        levels = _levels(checkpoints, test, plan)
+        rows = {} if folder is None else _there(folder / SWEEP_FILE, levels, policy, seed)
+        if on_network is not None:
+            on_network(len(rows) / len(levels), f"{len(rows)} of {len(levels)} levels are there")
+        for i, row in _played(levels, rows, policy, seed):
+            rows[i] = row
+            if folder is not None:
+                text = json.dumps([rows[i] for i in sorted(rows)], indent=2) + "\n"
+                files.write_text(folder / SWEEP_FILE, text)
+            if on_network is not None:
+                name = f"{row['agent']}, {row['kind'] or 'no noise'} {row['name']}"
+                on_network(len(rows) / len(levels), name)
+        ordered = [rows[i] for i in range(len(levels))]
+        if folder is not None:
+            files.write_text(folder / "noise.md", markdown(ordered))
+            figures.noise(ordered, "Senses that err, test rooms", folder / "noise.png")
+    return ordered
+
+
+@dataclasses.dataclass(frozen=True)
+class _Level:
+    """An agent at a level of noise."""
+
+    network: SavedNetwork
+    row: Row  # what its row begins with
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether it is without noise."""
+        return self.row["kind"] is None
+
+    def same(self, snapshot: Snapshot, policy: str, seed: int | None) -> Row:
+        """What is known of its row before it is played, and equal for all rows of the agent."""
+        test = self.network.test
+        return {
+            "policy": policy,
+            "updates": snapshot.updates,
+            "evaluation_seed": self.network.config.seed if seed is None else seed,
+            **({"data_version": snapshot.data_version} if test.data is None else {}),
+            "departures": dataclasses.replace(test, noise=None).departures or None,
+        }
+
+
+def _levels(
+    checkpoints: Sequence[Path | str],
+    test: EvalConfig,
+    plan: Sequence[tuple[str | None, str, sense_noise.SenseNoise]],
+) -> list[_Level]:
+    """All that a sweep plays, in the order of its rows."""
+    out = []
+    for run, agent in short_names(checkpoints).items():
+        (network,) = saved_networks.find(run, test=test)
+        for kind, name, noise in plan:
+            row = {
+                "agent": agent, "kind": kind, "level": float(name.split()[-1]), "name": name,
+                "noise": str(noise),
+            }  # fmt: skip
+            own = dataclasses.replace(test, noise=str(noise))
+            out.append(_Level(dataclasses.replace(network, test=own), row))
+    return out
+
+
+def _there(path: Path, levels: Sequence[_Level], policy: str, seed: int | None) -> dict[int, Row]:
+    """The rows that a sweep has written, by their place among all.
+
+    Raises:
+      FileError: they are of other agents, levels, episodes or seeds, or the file is broken.
+    """
+    if not path.exists():
+        return {}
+    content = jsons.load(path, links=False)
+    heads = [level.row for level in levels]
+    same: dict[str, Row] = {}
+    out = {}
+    if not isinstance(content, list):
+        raise FileError(path, "not the rows of a sweep")
+    for row in content:
+        results_file.check_groups(path, row, "a row, ")
+        head = {name: row.get(name) for name in heads[0]}
+        if head not in heads:
+            what = f"{head['agent']}, {head['kind'] or 'no noise'} {head['name']}"
+            raise FileError(path, f"holds {what}, which is not asked for; choose another --out")
+        level = levels[i := heads.index(head)]
+        if (agent := level.row["agent"]) not in same:
+            same[agent] = level.same(level.network.load(), policy, seed)
+        if differing := [name for name, value in same[agent].items() if row.get(name) != value]:
+            raise FileError(
+                path,
+                f"{agent} was played with other values of {', '.join(differing)}; "
+                "choose another --out",
+            )
+        out[i] = row
+    return out
+
+
+def _played(
+    levels: Sequence[_Level], rows: Mapping[int, Row], policy: str, seed: int | None
+) -> Iterator[tuple[int, Row]]:
+    """Plays the levels that have no row, and gives their places and rows."""
+    agents = {level.row["agent"] for i, level in enumerate(levels) if i not in rows}
+    # Differences need the episodes without noise, so these are played again.
+    again = [level.is_clean and level.row["agent"] in agents for level in levels]
+    networks = [one.network for i, one in enumerate(levels) if i not in rows or again[i]]
+    place = {id(level.network): i for i, level in enumerate(levels)}
+    clean: dict[str, Mapping[str, report.Columns]] = {}
     # Runs of one task are played in the order in which they are given, each from its first level.
-    keys = {id(network): key for key, network in networks.items()}
-    for done in saved_networks.evaluate([*networks.values()], policy == "greedy", seed):
-        run, i = keys[id(done.saved)]
-        (kind, name, noise), columns = plan[i], done.columns()
-        clean.setdefault(run, columns)
-        rows[run, i] = {
-            "agent": names[run],
-            "kind": kind,
-            "level": float(name.split()[-1]),
-            "name": name,
-            "noise": str(noise),
+    for done in saved_networks.evaluate(networks, policy == "greedy", seed):
+        level, columns = levels[i := place[id(done.saved)]], done.columns()
+        before = clean.setdefault(level.row["agent"], columns)
+        row = {
+            **level.row,
             **_by_group(
                 columns, lambda part: metrics.summarise(*(part[c] for c in metrics.COLUMNS))
             ),
-            "change": _changes(columns, clean[run]) if i else None,
-            "evaluation_seed": done.provenance.evaluation_seed,
+            "change": None if level.is_clean else _changes(columns, before),
+            **level.same(done.snapshot, policy, seed),
             "data_version": done.provenance.data_version,
-            "departures": test.departures or None,
         }
-        if on_network is not None:
-            on_network(len(rows) / len(networks), f"{names[run]}, {kind or 'no noise'} {name}")
-    ordered = [rows[key] for key in networks]
-    if out is not None:
-        _write(Path(out), ordered, policy)
-    return ordered
+        if i not in rows:
+            yield i, row
+        elif row != rows[i]:
+            raise ValueError(
+                f"{level.network.run}: plays the episodes otherwise than when the sweep began; "
+                "choose another --out"
+            )
 
 
 def _by_group(columns: Mapping[str, report.Columns], of: Callable[[report.Columns], Any]) -> dict:
@@ -107,22 +213,15 @@ def _changes(ours: Mapping[str, report.Columns], clean: Mapping[str, report.Colu
     }
 
 
-def _write(folder: Path, rows: Sequence[dict[str, Any]], policy: str) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    files.write_text(folder / "noise.md", markdown(rows, policy))
-    figures.noise(rows, "Senses that err, test rooms", folder / "noise.png")
-    files.write_text(folder / "noise.json", json.dumps(rows, indent=2) + "\n")
-
-
-def markdown(rows: Sequence[Mapping[str, Any]], policy: str) -> str:
+def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
     """`noise.md`: a table for each kind of noise, absolute and relative to the same without."""
     first = rows[0]
     lines = [
         "# Senses that err",
         "",
-        f"{policy} actions, scene tables {first['data_version']}, code {report.code_version()}. "
-        "In percent, L >= 1; in brackets, the share of the same agent's figure without noise. "
-        + metrics.COLLISION_FREE,
+        f"{first['policy']} actions, scene tables {first['data_version']}, "
+        f"code {report.code_version()}. In percent, L >= 1; in brackets, the share of the same "
+        "agent's figure without noise. " + metrics.COLLISION_FREE,
     ]
     if first["departures"]:
         lines += ["", f"**{in_markdown(describe_departures(first['departures']))}.**"]

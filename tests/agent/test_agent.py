@@ -221,6 +221,26 @@ def test_of_another_target_an_agent_has_never_seen_anything(triangulating_agent)
     assert same.sensors["triangulation"].normal.any()
 
 
+@dataclasses.dataclass(frozen=True)
+class Scored(Detection):
+    """A detection with the detector's confidence, if there is one."""
+
+    score: float | None = None
+
+
+def test_an_agent_is_shown_scores_and_takes_a_missing_one_for_1(glove):
+    config = TrainConfig(network=dataclasses.replace(CONFIG.network, scores=True))
+    model = make_model(config, ClassVocabulary())
+    agent = Agent(config, samples.parameters(model, glove.table(["Mug", "Bed"])), glove)
+    corners = ("mug", 0.1, 0.1, 0.3, 0.4)
+
+    def value(*seen):
+        return agent.act(agent.start(), seen, "mug")[1].value
+
+    assert value(Detection(*corners)) == value(Scored(*corners)) == value(Scored(*corners, 1.0))
+    assert value(Scored(*corners, 0.5)) != value(Detection(*corners))
+
+
 def test_a_custom_sensor_counts_and_matters(counting_agent):
     mug, sink = Detection("mug", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.6, 0.1, 0.8, 0.4)
     state = counting_agent.start(90)

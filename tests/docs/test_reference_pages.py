@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tdanet_jax.evaluation.report import Provenance
-from tdanet_jax.registry import SENSORS
+from tdanet_jax.evaluation.report import FLAGS, Provenance
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.scenes.visibility.rules import RULES
 from tests.support.pages import DOCS
@@ -56,7 +55,7 @@ def test_fields_of_the_results() -> None:
     told = named(section("evaluation", "Fields of `results.json`")) - {"Field"}
     groups = {"seen", "unseen", "by_room", "by_target"}
     fields = {field.name for field in dataclasses.fields(Provenance)}
-    assert told == {*fields, *groups, *SENSORS, "version", "commit"}
+    assert told == {*fields, *groups, *FLAGS, "version", "commit"}
 
 
 def test_fields_of_the_records() -> None:

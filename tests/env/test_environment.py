@@ -37,11 +37,11 @@ def test_it_has_the_rooms_classes_and_words_of_the_task(
     env, params = make("ithor-18/4", part, config_of(rooms_file))
     task = make_task(TrainConfig(), some_rooms, glove)
     training = part == "train"
-    rows = task.eval_params.rows
+    rows = task.eval_params.max_detections
     chex.assert_trees_all_equal(
         params, task.train_params.with_rows(rows) if training else task.eval_params
     )
-    assert task.train_params.rows < rows
+    assert task.train_params.max_detections < rows
     assert env.default_params is params
     assert (env.name, env.class_names, env.num_actions) == ("ithor-18/4", some_rooms.classes, 6)
     hidden = [env.class_names.index(name) for name in make_split("18/4").hidden]

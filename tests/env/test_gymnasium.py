@@ -99,7 +99,7 @@ def test_a_vector_holds_rows_words_target_and_sensors(config: TrainConfig) -> No
     key = jax.random.key(3)
     obs, _ = plain.reset(key)
     flat, state = env.reset(key)
-    rows, width = params.rows, plain.words.shape[1]
+    rows, width = params.max_detections, plain.words.shape[1]
     assert flat.shape == env.observation_space().shape == env.observation_space(params).shape
     table = np.asarray(flat[: rows * (4 + width)]).reshape(rows, 4 + width)
     shown = np.asarray(obs.mask)

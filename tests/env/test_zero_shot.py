@@ -20,6 +20,8 @@ from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.env import dynamics, zero_shot
 from tdanet_jax.env.types import EnvParams, EnvState
 from tdanet_jax.scenes import SceneTables
+from tdanet_jax.sense_noise import SenseNoise
+from tdanet_jax.sensors.noise import levels_of
 from tdanet_jax.splits import Split, make_split
 from tdanet_jax.task import make_task
 from tdanet_jax.training import learner
@@ -317,10 +319,12 @@ def test_noise_shows_no_hidden_class(rooms: SceneTables, glove: WordVectors) -> 
     known = np.setdiff1d(np.unique(task.train_params.row_class), hidden)
     np.testing.assert_array_equal(noise.known, known)
     assert not np.isin(noise.similar[known], hidden).any()
-    obs, *_ = jax.device_get(training_walk(task.train_params))
-    assert not np.isin(obs.classes[obs.mask], hidden).any()
-    spare = obs.classes[..., -4:][obs.mask[..., -4:]]
-    assert len(np.unique(spare)) > 30, "there should have been false positives"
+    alone = SenseNoise(misses=1.0, false_positives=4.0, swaps=0.2, confusions=0.3)
+    for levels in ({}, levels_of(alone)):
+        params = task.train_params.replace(noise=task.train_params.noise.replace(**levels))
+        obs, *_ = jax.device_get(training_walk(params))
+        assert not np.isin(obs.classes[obs.mask], hidden).any()
+    assert len(np.unique(obs.classes[obs.mask])) > 30, "there should have been false positives"
 
 
 @pytest.mark.parametrize("model", ["ssnet", "mjolnir-o"])

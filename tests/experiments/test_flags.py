@@ -535,7 +535,8 @@ OF_THE_TASK: dict[str, tuple[Any, str]] = {
     "odometry": (True, "tdanet"), "triangulation": (True, "tdanet"),
     "sensors": (("odometry",), "tdanet"), "inner_rate": (0.1, "savn"),
     "first_order": (True, "savn"), "precision": ("bfloat16", "tdanet"), "split": ("14/8", "tdanet"),
-    "model": ("ssnet", "tdanet"), "noise": ("mix", "tdanet"),
+    "model": ("ssnet", "tdanet"), "noise": ("mix", "tdanet"), "scores": (True, "tdanet"),
+    "robust_triangulation": (True, "tdanet"),
 }  # fmt: skip
 #: Settings with a test of their own below.
 HERE = ("data", "word_vectors", "checkpoint_minutes")
@@ -573,8 +574,10 @@ def contents(config: TrainConfig) -> tuple[Any, ...]:
 def test_a_setting_makes_another_task(name: str) -> None:
     value, model = OF_THE_TASK[name]
     config = TrainConfig(model=model, network=NetworkConfig(precision="float32", image="raster"))
-    if name == "triangulation":
+    if "triangulation" in name:
         config = changed(config, "odometry", True)
+    if name == "robust_triangulation":
+        config = changed(config, "triangulation", True)
     other = changed(config, name, value)
     other.check()
     assert contents(config) != contents(other)

@@ -86,6 +86,26 @@ def test_the_fast_forms_equal_the_printed_equations(
     np.testing.assert_allclose(fast, np.stack(plain), **CLOSE)
 
 
+def test_a_score_is_one_more_number_of_a_detection_and_1_of_the_target() -> None:
+    module = TDANetEncoder(H, columns=4)
+    words, obs = samples.words(), observations(FRAMES)
+    scores = np.random.default_rng(5).random(obs.mask.shape) * obs.mask
+    obs = obs.replace(boxes=jnp.concatenate([obs.boxes, scores[..., None]], axis=-1))
+
+    def encode(module: TDANetEncoder) -> jax.Array:
+        return module(module.prepare(jnp.asarray(words)), obs, None)
+
+    made = jax.eval_shape(functools.partial(module.init, method=encode), jax.random.key(0))
+    params = samples.randomised(made["params"])
+    fast = jax.jit(lambda given: module.apply({"params": given}, method=encode))(params)
+    exact = equations.in_float64(params)
+    plain = [
+        equations.encode(np, exact, rows.astype(float), word.astype(float))
+        for rows, word in equations.frames(obs, words)
+    ]
+    np.testing.assert_allclose(fast, np.stack(plain), **CLOSE)
+
+
 @pytest.mark.parametrize(
     ("backend", "attention", "siamese"),
     [

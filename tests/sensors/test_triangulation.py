@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import itertools
 import math
 from typing import Any, NamedTuple
@@ -54,11 +55,19 @@ class Box(NamedTuple):
     area: float
 
 
+class Ray(NamedTuple):
+    """A ray to a target, in metres from the start of an episode."""
+
+    start: np.ndarray  # [3]
+    along: np.ndarray  # [3], of length 1
+    pull: np.ndarray = np.zeros(3)  # added to the right side of the normal equations
+
+
 class SlowEstimate:
-    """All rays to one target in an episode, in metres from its start, in float64."""
+    """All rays to one target in an episode, in float64."""
 
     def __init__(self) -> None:
-        self.rays: list[tuple[np.ndarray, np.ndarray]] = []  # from where, and where to
+        self.rays: list[Ray] = []
         self.radius = 0.0
         self.stood: tuple[int, int] | None = None  # where it was asked for the last time
         self.moved = False  # since the last ray
@@ -80,16 +89,20 @@ class SlowEstimate:
         box = self.nearest(agent, boxes)
         if box is not None and self.degrees_with(agent, box) < 12:
             if self.moved:
-                self.rays.append((camera(agent), ray(agent, box)))
+                self.rays.append(self.ray_to(agent, box))
                 self.sums += 1
         else:
             box = max(boxes, key=lambda box: box.area)
-            self.rays, self.sums = [(camera(agent), ray(agent, box))], 1
+            self.rays, self.sums = [Ray(camera(agent), ray(agent, box))], 1
         self.moved = False
         distance = float(np.linalg.norm(self.seen_from(agent)))
         _, _, ahead = axes(agent.heading, 30 * agent.horizon)
         depth = distance * float(ray(agent, box) @ ahead)
         self.radius = min(math.sqrt(box.area) * depth, 1.0)
+
+    def ray_to(self, agent: SlowOdometry, box: Box) -> Ray:
+        """One more ray to what was seen before."""
+        return Ray(camera(agent), ray(agent, box))
 
     def degrees(self, agent: SlowOdometry, box: Box) -> float:
         """How far a box is from the direction of the estimate, as the agent stands and looks."""
@@ -105,7 +118,7 @@ class SlowEstimate:
         """What is known if the box is of what was seen before."""
         after = copy.copy(self)
         if self.moved:
-            after.rays = [*self.rays, (camera(agent), ray(agent, box))]
+            after.rays = [*self.rays, self.ray_to(agent, box)]
             after.sums += 1
         return after
 
@@ -141,11 +154,11 @@ class SlowEstimate:
     def equations(self) -> tuple[np.ndarray, np.ndarray]:
         """Three rows for each ray: a point's distance from it; and for the weak prior."""
         rows, right = [], []
-        for start, along in self.rays:
+        for start, along, _ in self.rays:
             across = np.eye(3) - np.outer(along, along)
             rows.append(across)
             right.append(across @ start)
-        start, along = self.rays[0]
+        start, along, _ = self.rays[0]
         weight = math.sqrt(1e-3)
         rows.append(weight * np.eye(3))
         right.append(weight * (start + 1.5 * along))
@@ -153,8 +166,9 @@ class SlowEstimate:
 
     def seen_from(self, agent: SlowOdometry) -> np.ndarray:
         """The target's position, from the camera along the axes of the start."""
-        place: np.ndarray = np.linalg.lstsq(*self.equations(), rcond=None)[0] - camera(agent)
-        return place
+        rows, right = self.equations()
+        moment = rows.T @ right + sum(ray.pull for ray in self.rays)
+        return np.asarray(np.linalg.solve(rows.T @ rows, moment) - camera(agent))
 
     def certainty(self, agent: SlowOdometry) -> float:
         """The weight along the line of sight, that is half at 0.03."""
@@ -258,21 +272,21 @@ def frame_of(boxes: Any, is_target: Any) -> Frame:
     return Frame(classes, boxes, mask, jnp.int32(3))
 
 
-@jax.jit
+@functools.partial(jax.jit, static_argnames="spec")
 def walked(
-    diagonal: Any, horizon: Any, actions: Any, blocked: Any, frames: Frames
+    diagonal: Any, horizon: Any, actions: Any, blocked: Any, frames: Frames, spec: Any = SPEC
 ) -> tuple[OdometryState, TargetEstimate, jax.Array]:
     """States and what is read of the target, [N + 1], at the start and after every action."""
 
     def step(states: Any, given: tuple) -> tuple[Any, Any]:
         action, blocked, frame = given
-        states = suite.update(SPEC, states, Motion(action, blocked))
-        states = suite.observe(SPEC, states, frame_of(*frame))
+        states = suite.update(spec, states, Motion(action, blocked))
+        states = suite.observe(spec, states, frame_of(*frame))
         pose = states["odometry"].replace(cells=jnp.zeros(0))
-        reading = suite.read(SPEC, states)["triangulation"]
-        return states, (pose, states["triangulation"], reading)
+        name = spec.sensors[-1]
+        return states, (pose, states[name], suite.read(spec, states)[name])
 
-    begun = suite.init(SPEC, Start(jnp.int32(diagonal), jnp.int32(horizon)))
+    begun = suite.init(spec, Start(jnp.int32(diagonal), jnp.int32(horizon)))
     actions = jnp.concatenate([jnp.array([NOTHING]), actions])
     return jax.lax.scan(step, begun, (actions, jnp.append(True, blocked), frames))[1]
 
@@ -519,7 +533,9 @@ class Story(NamedTuple):
     begun: int  # how often it began with another box
 
 
-def told(diagonal: bool, horizon: int, runs: list, seed: int, noise: float) -> Story:
+def told(
+    diagonal: bool, horizon: int, runs: list, seed: int, noise: float, kind: Any = SlowEstimate
+) -> Story:
     """A walk past one to three targets; nothing is in view where rounding would decide."""
     rng = np.random.default_rng(seed)
     walk = [(action, blocked) for action, blocked, times in runs for _ in range(times)][:LONGEST]
@@ -527,7 +543,7 @@ def told(diagonal: bool, horizon: int, runs: list, seed: int, noise: float) -> S
         (rng.uniform((-4, -1.5, -4), (4, 1, 4)), rng.uniform(0.05, 1.5))
         for _ in range(rng.integers(1, 4))
     ]
-    agent, slow = SlowOdometry(diagonal, horizon), SlowEstimate()
+    agent, slow = SlowOdometry(diagonal, horizon), kind()
     seen, readings, tolerance, begun = [], [], [], 0
     for t in range(len(walk) + 1):
         if t:
@@ -548,8 +564,8 @@ def told(diagonal: bool, horizon: int, runs: list, seed: int, noise: float) -> S
     return Story(walk, frames_of(seen, rng), readings, tolerance, begun)
 
 
-def assert_as_told(story: Story, diagonal: bool, horizon: int) -> None:
-    *_, found = walked(diagonal, horizon, *filled(story.walk), story.frames)
+def assert_as_told(story: Story, diagonal: bool, horizon: int, spec: Any = SPEC) -> None:
+    *_, found = walked(diagonal, horizon, *filled(story.walk), story.frames, spec)
     off = np.abs(np.asarray(found)[: len(story.readings)] - story.readings)
     assert (off <= story.tolerance).all(), off.max(axis=0)
 

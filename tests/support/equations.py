@@ -53,12 +53,13 @@ def encode(
     """Features of one frame.
 
     Args:
-      rows: [K, 3 + D] detections (x, y, S, word vector), K at least 1: a frame without any has one
-        all-zero row.
+      rows: [K, 3 + D] detections (x, y, S, word vector), or [K, 4 + D] with the score after S; K at
+        least 1: a frame without any has one all-zero row.
       word: [D], the target's word vector.
       dropped: [H] bool, units that dropout zeroes.
     """
-    target = xp.concatenate([xp.array(TARGET_BOX), word])
+    box = (*TARGET_BOX, 1.0)[: rows.shape[1] - len(word)]
+    target = xp.concatenate([xp.array(box), word])
     projected = linear(params["linear1"], rows)  # M_L1
     if target_attention:
         pooled = attention(xp, params, rows, target) @ projected  # V_L1 = V_att M_L1
@@ -178,7 +179,8 @@ def frames(obs: Any, words: Array) -> list[tuple[Array, Array]]:
             )
             if valid
         ]
-        found.append((np.array(rows or [np.zeros(3 + words.shape[1])]), words[int(target)]))
+        blank = np.zeros(obs.boxes.shape[-1] + words.shape[1])
+        found.append((np.array(rows or [blank]), words[int(target)]))
     return found
 
 

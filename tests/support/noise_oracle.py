@@ -16,6 +16,7 @@ class Detected(NamedTuple):
     x: float
     y: float
     area: float
+    score: float
 
 
 class Seen(NamedTuple):
@@ -41,32 +42,32 @@ def detect(
     seen: Sequence[Seen], longest: int, everything: Sequence[Seen], bits: Bits,
     level: Mapping[str, float], known: Sequence[int], similar: Sequence[Sequence[int]],
 ) -> list[Detected | None]:  # fmt: skip
-    """The rows of a frame: `longest` for what is there, four for duplicates, four for false ones.
+    """The rows of a frame: what is there, then up to four false ones and duplicates.
 
     Args:
       seen: what is in view.
-      longest: rows for it.
+      longest: number of rows.
       everything: all detections of all views.
-      bits: [8][longest + 9].
+      bits: [8][longest + 5].
       level: levels of noise by name.
       known: classes that are detected anywhere, ascending.
       similar: what each class is confused with.
     """
-    miss, change, pick, dx, dy, dw, dh, extra = bits
-    rows: list[Detected | None] = [None] * (longest + 8)
+    miss, change, pick, dx, dy, dw, dh, sure = bits
+    rows: list[Detected | None] = [None] * longest
     shown = []
     for i, one in enumerate(seen):
         tiny = level["small_misses"] * math.exp(-math.sqrt(one.box[2]) / 0.1)
         shown.append(share(miss[i]) >= 1 - (1 - level["misses"]) * (1 - tiny))
 
-    def perceived(one: Seen, i: int, known_label: bool) -> Detected | None:
+    def perceived(one: Seen, i: int, is_false: bool) -> Detected | None:
         cls = one.cls
         swaps, chance = level["swaps"], share(change[i])
-        if not known_label and chance < swaps:
+        if not is_false and chance < swaps:
             others = [c for c in known if c != one.cls]
             if others:
                 cls = others[pick[i] * len(others) // 65536]
-        elif not known_label and chance < swaps + (1 - swaps) * level["confusions"]:
+        elif not is_false and chance < swaps + (1 - swaps) * level["confusions"]:
             cls = similar[one.cls][pick[i] // 16384]
         x1, y1, x2, y2 = one.extent
         edges = []
@@ -80,27 +81,28 @@ def detect(
             edges.append((low, high, *ends))
         shift = [(a + b - low - high) / 2 for low, high, a, b in edges]
         ratio = math.prod((b - a) / (high - low) for low, high, a, b in edges)
-        return Detected(
-            cls, one.box[0] + shift[0], one.box[1] + shift[1], min(one.box[2] * ratio, 1.0)
-        )
+        right = cls == one.cls and not is_false
+        drawn = (max if right else min)(sure[i] // 256, sure[i] % 256) / 256
+        drawn *= 1 - math.exp(-math.sqrt(one.box[2]) / 0.1) / 2
+        score = 1 - level["scores"] * (1 - drawn)
+        x, y, area = one.box[0] + shift[0], one.box[1] + shift[1], one.box[2] * ratio
+        return Detected(cls, x, y, min(area, 1.0), score)
 
     for i, one in enumerate(seen):
         if shown[i]:
-            rows[i] = perceived(one, i, known_label=False)
-    for k in range(4):
-        i = longest + k
-        if seen and share(miss[i]) < level["duplicates"] * len(seen) / 4:
-            copied = extra[i] * len(seen) // 65536
-            if shown[copied]:
-                rows[i] = perceived(seen[copied], i, known_label=False)
-    for k in range(4):
-        i = longest + 4 + k
-        if share(miss[i]) < level["false_positives"] / 4:
-            at = int((extra[i] * 65536 + pick[i]) * len(everything) / 2**32)
-            one = everything[at]
+            rows[i] = perceived(one, i, is_false=False)
+    for k in range(min(4, longest - len(seen))):
+        i = len(seen) + k
+        false, again, copy, high, low, *_ = (field[longest + k] for field in bits)
+        if share(false) < level["false_positives"] / 4:
+            one = everything[int((high * 65536 + low) * len(everything) / 2**32)]
             x1, y1, x2, y2 = one.extent
             box = ((x1 + x2) / 2, (y1 + y2) / 2, (x2 - x1) * (y2 - y1))
-            rows[i] = perceived(Seen(one.cls, box, one.extent), i, known_label=True)
+            rows[i] = perceived(Seen(one.cls, box, one.extent), i, is_false=True)
+        elif seen and share(again) < level["duplicates"] * len(seen) / 4:
+            copied = copy * len(seen) // 65536
+            if shown[copied]:
+                rows[i] = perceived(seen[copied], i, is_false=False)
     return rows
 
 

@@ -251,14 +251,13 @@ def test_the_activation_cache_changes_neither_the_loss_nor_its_gradient(sensors:
         assert all(np.asarray(grad).any() for grad in cached[1]["way"].values())
 
 
-@pytest.mark.slow
 def test_sensor_states_begin_with_every_episode_and_last_as_long_as_it() -> None:
     _, after, steps, *_ = example(sensors=True)
     whole = jax.tree.map(
         lambda *x: jnp.concatenate([x[0], x[1][None]]),
         (steps.obs, steps.is_first),
         (
-            jax.vmap(dynamics.observe, (0, None))(after.env_state, TASKS[True][1]),
+            jax.jit(jax.vmap(dynamics.observe, (0, None)))(after.env_state, TASKS[True][1]),
             after.recurrent.is_first,
         ),
     )
