@@ -110,13 +110,17 @@ class Floor:
         Returns:
           The objects in their places; None if there is none.
         """
+        boxes = np.array([*(item.box for item in unit), *solid])
+        free = np.reshape([*zones], (-1, 2, 3))
         for turns, place in places:
-            there = [_moved(item, turns, place) for item in unit]
-            kept = [_moved_box(zone, turns, place) for zone in zones]
-            taken = [_moved_box(box, turns, place) for box in solid]
-            if self._fits(there, kept, taken, on_wall):
+            taken, kept = (_moved_boxes(some, turns, place) for some in (boxes, free))
+            if not self._has_room(taken, kept, on_wall):
+                continue
+            there = [shifted(turned(item, turns, np.zeros(3)), place) for item in unit]
+            if self._stays_connected(there, kept, taken[len(unit) :], on_wall):
                 self.items += there
-                self._solid += taken
+                self._zones += [*kept]
+                self._solid += [*taken[len(unit) :]]
                 return there
         return None
 
@@ -124,22 +128,20 @@ class Floor:
         """Leaves a box [2, 3] free from now on."""
         self._zones.append(zone)
 
-    def _fits(
-        self,
-        there: Sequence[SceneObject],
-        zones: list[np.ndarray],
-        solid: list[np.ndarray],
-        on_wall: bool,
-    ) -> bool:
-        """Whether objects have room; if so, their zones and blocked points are noted."""
-        boxes = np.array([*(item.box for item in there), *solid])
-        every = np.array([*boxes, *zones])
+    def _has_room(self, boxes: np.ndarray, zones: np.ndarray, on_wall: bool) -> bool:
+        """Whether `boxes` [N, 2, 3] and `zones` [M, 2, 3] are in the room and meet nothing."""
+        every = np.concatenate([boxes, zones])
         level = every[:, :, LEVEL]
         beyond = np.maximum(self.area[0] - level[:, 0], level[:, 1] - self.area[1])
         if not on_wall and beyond.max() > ROUNDED:
             return False
-        if self._collides(every) or any(_overlap(boxes, zone).any() for zone in self._zones):
-            return False
+        there = [*self._solid, *(item.box for item in self.items)]
+        return not (_overlap(every, there) or _overlap(boxes, self._zones))
+
+    def _stays_connected(
+        self, there: Sequence[SceneObject], zones: np.ndarray, solid: np.ndarray, on_wall: bool
+    ) -> bool:
+        """Whether an agent still reaches everything; if so, the points that are blocked are noted."""
         free = self._free & reachable.clear(self._places, STANDING, there)
         for box in solid:
             free &= _gap(self._places, box[:, LEVEL]) >= RADIUS
@@ -147,19 +149,14 @@ class Floor:
         if part.sum() < CONNECTED * max(free.sum(), 1) or not part.any():
             return False
         near = there[0].box[:, LEVEL] + _AROUND * (SEEN if on_wall else NEAR)
-        around = [near] if on_wall else [zone[:, LEVEL] for zone in zones] or [near]
-        access = [*self._access, *around]
+        around = [near] if on_wall or not len(zones) else [*zones[:, :, LEVEL]]
+        access = np.array([*self._access, *around])[:, :, None]  # [N, 2, 1, 2]
         reached = self._places[part]
-        if not all(((a[0] <= reached) & (reached <= a[1])).all(axis=1).any() for a in access):
+        inside = ((access[:, 0] <= reached) & (reached <= access[:, 1])).all(axis=-1)
+        if not inside.any(axis=-1).all():
             return False
-        self._free, self._access = free, access
-        self._zones += zones
+        self._free, self._access = free, [*self._access, *around]
         return True
-
-    def _collides(self, boxes: np.ndarray) -> bool:
-        """Whether any of `boxes` [N, 2, 3] meets something that is there."""
-        taken = [*self._solid, *(item.box for item in self.items)]
-        return any(_overlap(boxes, box).any() for box in taken)
 
     def copy(self) -> Floor:
         """The same floor, to try something on."""
@@ -274,19 +271,15 @@ def _outline(area: np.ndarray, notch: np.ndarray | None) -> np.ndarray:
     return np.array([(x1, z1), (x2, z1), (x2, b1), (a1, b1), (a1, z2), (x1, z2)])
 
 
-def _moved(item: SceneObject, turns: int, place: np.ndarray) -> SceneObject:
-    return shifted(turned(item, turns, np.zeros(3)), place)
-
-
-def _moved_box(box: np.ndarray, turns: int, place: np.ndarray) -> np.ndarray:
+def _moved_boxes(boxes: np.ndarray, turns: int, place: np.ndarray) -> np.ndarray:
+    """Boxes [N, 2, 3] turned clockwise by quarters around the origin, and shifted."""
     for _ in range(turns % 4):
-        x, y, z = box.T
-        box = np.sort(np.stack([z, y, -x], axis=1), axis=0)
-    return box + place
+        boxes = np.sort(boxes[..., [2, 1, 0]] * np.array([1, 1, -1]), axis=1)
+    return boxes + place
 
 
 def _moved_area(area: np.ndarray, turns: int, place: np.ndarray) -> np.ndarray:
-    return _moved_box(_raised(area, 0.0), turns, place)[:, LEVEL]
+    return _moved_boxes(_raised(area, 0.0)[None], turns, place)[0][:, LEVEL]
 
 
 def _raised(area: np.ndarray, height: float) -> np.ndarray:
@@ -294,12 +287,14 @@ def _raised(area: np.ndarray, height: float) -> np.ndarray:
     return np.insert(area, 1, [0.0, height], axis=1)
 
 
-def _overlap(boxes: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Whether each of `boxes` [N, 2, 3] gets into a box by more than they may touch: [N] bool."""
-    common = np.minimum(boxes[:, 1], box[1]) - np.maximum(boxes[:, 0], box[0])
-    thinner = np.minimum(boxes[:, 1] - boxes[:, 0], box[1] - box[0])
-    result: np.ndarray = (common > np.minimum(TOUCHING, thinner / 2)).all(axis=1)
-    return result
+def _overlap(boxes: np.ndarray, others: Sequence[np.ndarray]) -> bool:
+    """Whether any of `boxes` [N, 2, 3] gets into any of others by more than they may touch."""
+    if not len(others):
+        return False
+    one, other = boxes[:, None], np.array(others)
+    common = np.minimum(one[:, :, 1], other[:, 1]) - np.maximum(one[:, :, 0], other[:, 0])
+    thinner = np.minimum(one[:, :, 1] - one[:, :, 0], other[:, 1] - other[:, 0])
+    return bool((common > np.minimum(TOUCHING, thinner / 2)).all(axis=-1).any())
 
 
 def _gap(places: np.ndarray, area: np.ndarray) -> np.ndarray:

@@ -124,10 +124,10 @@ class Library:
         if not len(sizes):
             return known[draw.integers(len(known))]
         size = sizes[draw.integers(len(sizes))]
-        like = sorted(known, key=lambda piece: float(np.abs(np.log(piece.size / size)).sum()))
-        parts = like[0].parts if like else ()
-        levels = next((piece.levels for piece in like if piece.levels), ())
-        return Piece(name, size, parts, levels)
+        logs = np.log([piece.size for piece in known])
+        order = np.abs(logs - np.log(size)).sum(axis=1).argsort(kind="stable")
+        levels = (known[i].levels for i in order if known[i].levels)
+        return Piece(name, size, known[order[0]].parts, next(levels, ()))
 
     def objects(
         self, piece: Piece, number: int, draw: np.random.Generator, degrees: float = 0.0
