@@ -41,7 +41,7 @@ PROCTHOR = Source(
     "ec0121ba0597525ac539df6923de11796349c329c4946637db3cfc0bd09c9831",
     "Apache-2.0",
     "AI2-THOR's object metadata of the default frame of each of the 120 iTHOR rooms: ithor.npz; "
-    "sizes of models that no iTHOR test room contains, and how they are arranged: furniture.json.gz",
+    "sizes of models that no test room contains, and how they are arranged: furniture.json.gz",
     "procthor-0.0.1.dev2.dist-info/LICENSE",
 )
 ALFWORLD = Source(

@@ -94,18 +94,18 @@ def load(path: Path | None = None) -> Catalogue:
         groups=tuple(
             tuple(
                 Member(
-                    member["class"],
-                    member["parent"],
-                    *(tuple(member[key]) for key in ("side", "offset", "align")),
-                    member["above"],
-                    member["turn"],
-                    tuple(member["spread"]),
+                    object_class=member["class"],
+                    **{key: _fixed(value) for key, value in member.items() if key != "class"},
                 )
                 for member in group
             )
             for group in content["groups"]
         ),
     )
+
+
+def _fixed(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
 
 
 def build_asset(procthor_wheel: Path, out_dir: Path, rooms: list[Scene]) -> Path:

@@ -21,6 +21,9 @@ NEAR = 0.9  # metres from where an agent can stand to anything on the floor, at 
 SEEN = 1.3  # metres, likewise, to anything on a wall
 #: Share of the free points that must be connected once something is put down.
 CONNECTED = 0.93
+#: Where the front (+z) and the right side (+x) point after quarters of a turn, as x and z.
+AHEAD = np.array([(0, 1), (1, 0), (0, -1), (-1, 0)], np.float64)
+RIGHT = np.roll(AHEAD, -1, axis=0)
 ROUNDED = 1e-3  # metres by which coordinates may be off a wall
 TALL = 3.0  # metres: the height of a room
 WALL = 0.04  # metres between walls and what stands at them
@@ -45,7 +48,7 @@ class Wall:
     @property
     def inward(self) -> np.ndarray:
         """Direction to the inside of the room, [2]."""
-        return np.array([(0, 1), (1, 0), (0, -1), (-1, 0)][self.turns], np.float64)
+        return AHEAD[self.turns]
 
     def at(self, along: float, inward: float = 0.0) -> np.ndarray:
         """A place [3] on the floor, metres along the wall and away from it."""
@@ -141,7 +144,7 @@ class Floor:
     def _stays_connected(
         self, there: Sequence[SceneObject], zones: np.ndarray, solid: np.ndarray, on_wall: bool
     ) -> bool:
-        """Whether an agent still reaches everything; if so, the points that are blocked are noted."""
+        """Whether an agent still reaches everything; if so, blocked points are noted."""
         free = self._free & reachable.clear(self._places, STANDING, there)
         for box in solid:
             free &= _gap(self._places, box[:, LEVEL]) >= RADIUS
@@ -230,9 +233,9 @@ class Floor:
 _AROUND = np.array([[-1.0, -1.0], [1.0, 1.0]])
 
 
-def span_of(unit: Sequence[SceneObject], zones: Sequence[np.ndarray] = ()) -> np.ndarray:
-    """The area [2, 2] around objects, without zones in front of them but with those at the sides."""
-    boxes = np.array([*(item.box for item in unit), *zones])[:, :, LEVEL]
+def span_of(unit: Sequence[SceneObject]) -> np.ndarray:
+    """The area [2, 2] around objects."""
+    boxes = np.array([item.box for item in unit])[:, :, LEVEL]
     return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
@@ -250,7 +253,7 @@ def _walls(area: np.ndarray, notch: np.ndarray | None) -> Iterator[Wall]:
         length = float(np.abs(way).max())
         along = way / length
         inward = np.array([-along[1], along[0]])
-        turns = [(0, 1), (1, 0), (0, -1), (-1, 0)].index(tuple(np.rint(inward).astype(int).tolist()))
+        turns = int((AHEAD @ inward).argmax())
         yield Wall(start, along, length, turns)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from tdanet_jax.scenes.generation.catalogue import Catalogue, Member
-from tdanet_jax.scenes.generation.floor import CLEAR, Floor, span_of, zone_before
+from tdanet_jax.scenes.generation.floor import AHEAD, RIGHT, Floor, span_of, zone_before
 from tdanet_jax.scenes.generation.pieces import Library, Piece, box_of, yawed
 from tdanet_jax.scenes.generation.plan import Plan, Plans
 from tdanet_jax.scenes.placement import LEVEL, Room, Statistics, shifted
@@ -57,7 +57,9 @@ class Furnisher:
 
     # Objects
 
-    def make(self, name: str, piece: Piece | None = None, degrees: float = 0.0) -> list[SceneObject]:
+    def make(
+        self, name: str, piece: Piece | None = None, degrees: float = 0.0
+    ) -> list[SceneObject]:
         """A piece of a class, with its parts, around the origin; it is one less to be placed."""
         piece = piece or self.library.choose(name, self.draw)
         number = next(self._ids)
@@ -116,11 +118,9 @@ class Furnisher:
         bottoms = self.plans.bottoms.get((self.plan.room_type, name), np.array([1.2]))
         width, height, depth = piece.size
         bottom = float(np.clip(self.draw.choice(bottoms), 0, max(HIGHEST - height, 0.05)))
-        back = (inside - 1) * min(depth, 0.15)
-        item = self.block(
-            name, (-width / 2, bottom, back), (width / 2, bottom + height, back + min(depth, 0.5))
-        )
-        return item
+        front = min(depth, 0.5) if inside == 1.0 else inside * min(depth, 0.15)
+        low = (-width / 2, bottom, front - min(depth, 0.5))
+        return self.block(name, low, (width / 2, bottom + height, front))
 
     def _along_walls(self, unit: Sequence[SceneObject]) -> Iterator[tuple[int, np.ndarray]]:
         span = span_of(unit)
@@ -143,8 +143,10 @@ class Furnisher:
         height = 0.0 if rest is None or rest.height is None else rest.height
         base = top + height if rest is None or rest.from_top else holder.box[0, 1] + height
         (width, tall, depth), x, z = self.library.choose(name, self.draw).size, x1 + x2, z1 + z2
-        item = self.block(name, ((x - width) / 2, base, max((z - depth) / 2, 0)),
-                          ((x + width) / 2, base + tall, max((z - depth) / 2, 0) + depth))  # fmt: skip
+        back = max((z - depth) / 2, 0)
+        item = self.block(
+            name, ((x - width) / 2, base, back), ((x + width) / 2, base + tall, back + depth)
+        )
         return dataclasses.replace(item, parents=(holder.object_id,))
 
     # Furniture
@@ -232,12 +234,10 @@ class Furnisher:
             width, depth = spans if turns % 2 == 0 else spans[::-1]
             own = np.ptp(unit[0].box, axis=0)[LEVEL]
             middle = host.box.mean(axis=0)
-            right = np.array([(1, 0), (0, -1), (-1, 0), (0, 1)][turns], np.float64)
-            front = np.array([(0, 1), (1, 0), (0, -1), (-1, 0)][turns], np.float64)
             places = []
             for side in self.draw.permutation(np.array([-1, 1])):
-                away = side * (width / 2 + own[0] / 2 + 0.03) * right
-                x, z = middle[LEVEL] + away + front * (own[1] - depth) / 2
+                away = side * (width / 2 + own[0] / 2 + 0.03) * RIGHT[turns]
+                x, z = middle[LEVEL] + away + AHEAD[turns] * (own[1] - depth) / 2
                 places.append((turns, np.array([x, 0.0, z])))
             if self.floor.put(unit, places) is not None:
                 return True
@@ -247,7 +247,9 @@ class Furnisher:
     def furnish(self) -> None:
         """All furniture that is still left, largest first, then what hangs on walls and lies on
         the floor."""
-        names = [n for n in sorted(self.left) if self.has(n) and n not in (*ON_WALLS, *ON_FURNITURE)]
+        names = [
+            n for n in sorted(self.left) if self.has(n) and n not in (*ON_WALLS, *ON_FURNITURE)
+        ]
         standing = [n for n in names if self.plans.on_floor(self.plan.room_type, n) > 0.5]
         areas = {n: float(np.prod(self.library.known(n)[0].size[[0, 2]])) for n in standing}
         pickup = {n: self.library.flags[n][1] for n in standing}
@@ -294,10 +296,14 @@ class Furnisher:
             scene = self.scene(name)
             room = Room(scene, self.usual, {}, scene.objects, self.levels)
             small = []
-            for n in kinds or [n for n in sorted(self.left) if self.library.flags.get(n, (0, 0))[1]]:
+            for n in kinds or [
+                n for n in sorted(self.left) if self.library.flags.get(n, (0, 0))[1]
+            ]:
                 while self.has(n):
                     small.append(self._small(n))
-            small.sort(key=lambda item: (-float(np.prod(np.ptp(item.box, axis=0)[LEVEL])), item.object_id))
+            small.sort(
+                key=lambda item: (-float(np.prod(np.ptp(item.box, axis=0)[LEVEL])), item.object_id)
+            )
             for item in small:
                 there = room.put([item], self.draw)
                 self.floor.items += there or []
@@ -352,4 +358,3 @@ def _notch(plan: Plan, draw: np.random.Generator) -> np.ndarray | None:
         return None
     low = np.where(corner == 0, -half, half - sides)
     return np.stack([low, low + sides])
-

@@ -97,7 +97,7 @@ class Plans:
         rooms = self._known[room_type]
         like = rooms[draw.integers(len(rooms))]
         counts: Counter[str] = Counter()
-        sources = {}
+        sources: dict[object, _Known] = {}
         for name in sorted({name for room in rooms for name in room.counts}):
             key = next((names for names in TOGETHER if name in names), name)
             other = rooms[draw.integers(len(rooms))]

@@ -1,8 +1,8 @@
-"""What is special about each of iTHOR's room types: what is built in, and which groups come first."""
+"""What comes first in each of iTHOR's room types: what is built in, and groups."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -12,6 +12,12 @@ from tdanet_jax.scenes.generation.floor import WALL
 from tdanet_jax.scenes.generation.furnish import Furnisher
 from tdanet_jax.scenes.placement import LEVEL
 
+#: What is built in.
+IN_KITCHENS = ("Cabinet", "CounterTop", "Drawer", "Faucet", "Fridge", "Sink", "SinkBasin",
+               "StoveBurner", "StoveKnob")  # fmt: skip
+IN_BATHROOMS = ("Bathtub", "BathtubBasin", "Cabinet", "CounterTop", "Drawer", "Faucet",
+                "ShowerCurtain", "ShowerDoor", "ShowerGlass", "ShowerHead", "Sink",
+                "SinkBasin")  # fmt: skip
 #: A coffee table in front of the sofa of a group, whose index is filled in.
 COFFEE_TABLE = Member("CoffeeTable", -1, (0, -1), (0.0, -0.42), (0, 1), False, 0.0, (0.2, 0.0, 0.0))
 
@@ -20,9 +26,7 @@ def kitchen(room: Furnisher) -> bool:
     """Counters, then a dining table with chairs."""
     if not counters.kitchen(room):
         return False
-    for name in ("CounterTop", "Cabinet", "Drawer", "Sink", "SinkBasin", "StoveBurner", "StoveKnob",
-                 "Faucet", "Fridge"):  # fmt: skip
-        room.left[name] = 0
+    _leave(room, IN_KITCHENS)
     _dining(room)
     return True
 
@@ -55,14 +59,14 @@ def bathroom(room: Furnisher) -> bool:
     if room.plan.counts["CounterTop"]:
         done = counters.vanity(room)
     else:
-        done = all([counters.pedestal(room) for _ in range(max(room.left["Sink"], 1))])
+        done = counters.pedestal(room)
+        while done and room.left["Sink"] > 0:
+            done = counters.pedestal(room)
     if room.has("ShowerDoor") or room.has("ShowerGlass"):
         _shower(room)
     while done and room.has("Toilet"):
         done = _toilet(room)
-    for name in ("CounterTop", "Cabinet", "Drawer", "Sink", "SinkBasin", "Faucet", "Bathtub",
-                 "BathtubBasin", "ShowerDoor", "ShowerGlass", "ShowerHead", "ShowerCurtain"):  # fmt: skip
-        room.left[name] = 0
+    _leave(room, IN_BATHROOMS)
     return done
 
 
@@ -74,21 +78,27 @@ BUILDERS: dict[str, Callable[[Furnisher], bool]] = {
 }
 
 
+def _leave(room: Furnisher, names: Sequence[str]) -> None:
+    """Leaves out what is still left of some classes: their numbers follow from the room."""
+    for name in names:
+        room.left[name] = 0
+
+
 def _dining(room: Furnisher) -> None:
     while room.has("DiningTable"):
         where = ("middle", "edge") if room.draw.random() < 0.6 else ("edge", "middle")
         groups = room.groups_of("DiningTable")
-        if not any(room.put_group(group, (), where) for group in groups[:3]):
-            if not room.stand("DiningTable"):
-                break
+        grouped = any(room.put_group(group, (), where) for group in groups[:3])
+        if not grouped and not room.stand("DiningTable"):
+            break
 
 
 def _desks(room: Furnisher) -> None:
     while room.has("Desk"):
         groups = room.groups_of("Desk")
-        if not any(room.put_group(group, (), ("edge", "corner")) for group in groups):
-            if not room.stand("Desk"):
-                break
+        grouped = any(room.put_group(group, (), ("edge", "corner")) for group in groups)
+        if not grouped and not room.stand("Desk"):
+            break
 
 
 def _television(room: Furnisher) -> None:
@@ -128,7 +138,7 @@ def _toilet(room: Furnisher) -> bool:
     """A toilet at a wall, with the paper beside it."""
     before = room.left.copy()
     unit = room.make("Toilet")
-    (x1, _, z1), (x2, _, z2) = unit[0].box
+    (x1, _, _), (x2, _, z2) = unit[0].box
     free = np.array([(x1, 0.0, z2 + 0.02), (x2, 0.3, z2 + 0.6)])
     there = room.floor.put(unit, room.places(unit, ("edge",)), [free])
     if there is None:
@@ -138,8 +148,8 @@ def _toilet(room: Furnisher) -> bool:
     turns = round(toilet.rotation[1] / 90) % 4
     for wall in room.floor.walls:
         offset = toilet.box.mean(axis=0)[LEVEL] - wall.start
-        if wall.turns == turns and 0 < offset @ wall.along < wall.length and offset @ wall.inward < 1:
-            along = float(offset @ wall.along)
+        along, inward = float(offset @ wall.along), float(offset @ wall.inward)
+        if wall.turns == turns and 0 < along < wall.length and 0 < inward < 1:
             sides = along + np.array([-1, 1]) * room.draw.uniform(0.42, 0.6)
             ways = [(turns, wall.at(float(s))) for s in room.draw.permutation(sides)
                     if 0.1 < s < wall.length - 0.1]  # fmt: skip

@@ -35,7 +35,9 @@ class Generator:
         self._library = Library(scenes, self._catalogue, self._usual)
         self._plans = Plans(scenes)
         if lacking := [room for room in BUILDERS if room not in self._plans.room_types]:
-            raise SceneError(f"rooms are generated after training rooms, and there is no {lacking[0]}")
+            raise SceneError(
+                f"rooms are generated after training rooms, and there is no {lacking[0]}"
+            )
 
     def room(self, number: int, seed: int) -> Scene:
         """A room, with its number from 1; types take turns.
