@@ -287,7 +287,7 @@ class Room:
         found = self.put(unit, draw) if unit[0].object_id in self._support else None
         if found is None and self._free(_around(unit)[None], None).all():
             found = [*unit]
-            self._there += found
+            self._there += unit
         return found
 
     def put(
@@ -297,8 +297,8 @@ class Room:
 
         Its place is then taken.
         """
-        found = self._find(unit, draw)
-        self._there += found or []
+        if (found := self._find(unit, draw)) is not None:
+            self._there += found
         return found
 
     def _find(

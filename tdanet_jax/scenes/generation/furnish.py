@@ -175,6 +175,8 @@ class Furnisher:
                     heights = self.levels.get(parent.object_id, ())
                     y = parent.box[0, 1] + (heights[-1] if heights else np.ptp(parent.box[:, 1]))
                 unit = [shifted(item, np.array([at[0], y, at[1]])) for item in unit]
+                if member.above:
+                    unit[0] = dataclasses.replace(unit[0], parents=(parent.object_id,))
             found.append(unit)
         return found
 

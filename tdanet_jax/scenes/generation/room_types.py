@@ -12,6 +12,8 @@ from tdanet_jax.scenes.generation.floor import WALL
 from tdanet_jax.scenes.generation.furnish import Furnisher
 from tdanet_jax.scenes.placement import LEVEL
 
+#: What is built in, and not generated: a counter in a bedroom.
+BUILT_IN = ("Cabinet", "CounterTop", "Drawer")
 #: What is built in.
 IN_KITCHENS = ("Cabinet", "CounterTop", "Drawer", "Faucet", "Fridge", "Sink", "SinkBasin",
                "StoveBurner", "StoveKnob")  # fmt: skip
@@ -33,6 +35,7 @@ def kitchen(room: Furnisher) -> bool:
 
 def living_room(room: Furnisher) -> bool:
     """Television and sofa, a dining table with chairs."""
+    _leave(room, BUILT_IN)
     _television(room)
     _dining(room)
     _desks(room)
@@ -41,6 +44,7 @@ def living_room(room: Furnisher) -> bool:
 
 def bedroom(room: Furnisher) -> bool:
     """Beds with their pillows and side tables, desks with chairs."""
+    _leave(room, BUILT_IN)
     while room.has("Bed"):
         groups = [g for g in room.groups_of("Bed") if len(g) <= 1 + room.left["Pillow"]]
         tried = [*groups, (Member("Bed", -1, (0, 0), (0, 0), (0, 0), False, 0.0, (0, 0, 0)),)]

@@ -14,10 +14,11 @@ from tdanet_jax.scenes.generation.room_types import BUILDERS
 from tdanet_jax.scenes.placement import statistics
 from tdanet_jax.scenes.scene import Scene, SceneError
 
-ATTEMPTS = 50  # for a room
+ATTEMPTS = 200  # for a room
 LEAST, MOST = 0.75, 1.2  # share of the reachable points of a plan that a room has
 MISSING = 0.1  # share of a plan's objects for which a room may have no place
 GROWTH = 1.04  # what has no place gets longer walls
+SLOWLY = 0.25  # power of a share by which sides change: points grow faster than the floor
 SCALED = 6  # attempts with a plan
 
 
@@ -62,7 +63,7 @@ class Generator:
             # The same again, larger or smaller, until an agent has as much room as it should.
             share = len(room.floor.points) / plan.points
             if not LEAST <= share <= MOST:
-                plan = plan.scaled(share**-0.5)
+                plan = plan.scaled(share**-SLOWLY)
                 continue
             scene = room.scatter(name)
             if room.missing <= MISSING:
