@@ -485,10 +485,10 @@ SHOWN = {
     "episodes": "training/test_run.py::test_the_budget_in_episodes_ends_the_run",
     "targets": "test_targets.py::test_any_target_can_be_unseen",
     "variants": "scenes/test_variants.py::test_a_run_trains_in_variants_and_is_evaluated_as_ever",
-    "generated": "scenes/test_generated.py::test_a_run_trains_in_generated_rooms_and_is_evaluated_as"
-    "_ever",
-    "generated_only": "scenes/test_generated.py::test_a_run_trains_in_generated_rooms_and_is_evaluate"
-    "d_as_ever",
+    "generated": "scenes/test_generated.py::test_a_run_trains_in_generated_rooms_and_is_evaluated_"
+    "as_ever",
+    "generated_only": "scenes/test_generated.py::test_a_run_trains_in_generated_rooms_and_is_"
+    "evaluated_as_ever",
     "minutes": "training/test_run_bookkeeping.py::test_time_and_rows_continue",
     "seed": "training/test_run.py::test_another_seed_gives_another_run",
     "validation": "test_splits.py::test_validation_touches_neither_test_rooms_nor_unseen_classes",

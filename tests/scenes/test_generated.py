@@ -12,20 +12,24 @@ import pytest
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneTables, cache, dataset, generated
-from tdanet_jax.scenes.dataset import Rooms
-from tdanet_jax.scenes.generation.rooms import Generator
+from tdanet_jax.scenes import ithor as bundled
+from tdanet_jax.scenes.dataset import Extras, Rooms
+from tdanet_jax.scenes.records import of_scenes
 from tdanet_jax.scenes.scene import Scene, SceneError
-from tdanet_jax.splits import make_split
 from tdanet_jax.task import task_in
 from tests.support import toy
 
 SMALL = NetworkConfig(width=8, hidden=4, precision="float32")
-KNOWN = make_split("22/0").train_scenes
+#: Two training rooms of each type, one that validation evaluates in, and a test room.
+KNOWN = tuple(f"FloorPlan{number + i}" for number in (9, 209, 309, 409) for i in (0, 1))
+NAMES = (*KNOWN, "FloorPlan20", "FloorPlan30")
 
 
 @pytest.fixture(scope="module")
 def rooms(ithor: SceneTables) -> Rooms:
-    return Rooms(ithor, None)
+    """Some of the bundled rooms, as if from a file."""
+    scenes = [scene for scene in bundled.load_scenes() if scene.name in NAMES]
+    return Rooms(ithor.subset(NAMES), Extras(), records=of_scenes(scenes))
 
 
 @pytest.fixture(autouse=True)
@@ -44,7 +48,7 @@ def test_a_file_says_how_it_was_made_and_is_the_same_again(rooms: Rooms, tmp_pat
     assert back.extras is not None
     assert back.extras.parts == dict.fromkeys(back.tables.scenes, "train")
     assert {**back.extras.made} == {
-        "command": "generate", "rooms": 2, "seed": 3, "known": "80 rooms",
+        "command": "generate", "rooms": 2, "seed": 3, "known": "8 rooms",
         "source": generated.source(rooms, KNOWN), "version": back.extras.made["version"],
     }  # fmt: skip
     [scene, _] = back.scenes(back.tables.scenes)
@@ -57,12 +61,16 @@ def test_rooms_are_built_once_in_chunks_whatever_their_number(
 ) -> None:
     made: list[int] = []
 
-    def room(_: Generator, number: int, seed: int) -> Scene:
-        made.append(number)
-        assert seed == generated.SEED
-        return dataclasses.replace(toy.corridor(), name=f"Room{number}")
+    class Recorder:
+        def __init__(self, scenes: list[Scene]) -> None:
+            assert {scene.name for scene in scenes} <= {*KNOWN}
 
-    monkeypatch.setattr(Generator, "room", room)
+        def room(self, number: int, seed: int) -> Scene:
+            made.append(number)
+            assert seed == generated.SEED
+            return dataclasses.replace(toy.corridor(), name=f"Room{number}")
+
+    monkeypatch.setattr(generated, "Generator", Recorder)
     monkeypatch.setattr(generated, "CHUNK", 2)
     told: list[tuple[float, int]] = []
     tables = generated.load(rooms, KNOWN, 3, lambda done, total: told.append((done, total)))
@@ -81,19 +89,19 @@ def test_rooms_are_built_once_in_chunks_whatever_their_number(
 
 def test_what_is_seen_from_nowhere_is_left_out() -> None:
     corridor = toy.corridor()
-    far = toy.thing("Bread", (0.0, 0.5, 9.0))
-    apple, far = (dataclasses.replace(o, pickupable=True) for o in (*corridor.objects, far))
-    sofa = toy.thing("Sofa", (0.0, 0.5, 12.0))
-    scene = dataclasses.replace(corridor, objects=(apple, far, sofa))
+    cabinet = toy.thing("Cabinet", (0.0, 0.6, 2.25), (0.4, 0.4, 0.4))
+    bread = toy.thing("Bread", (0.0, 0.6, 2.25))  # in the cabinet, which is closed
+    apple, bread = (dataclasses.replace(o, pickupable=True) for o in (*corridor.objects, bread))
+    scene = dataclasses.replace(corridor, objects=(apple, bread, cabinet))
     kept, tables = generated._seen(scene, ("Apple", "Bread"))
-    assert [item.object_class for item in kept.objects] == ["Apple", "Sofa"]
-    assert tables.object_id == ("Apple|0", "Sofa|0")
+    assert [item.object_class for item in kept.objects] == ["Apple", "Cabinet"]
+    assert tables.object_id == ("Apple|0", "Cabinet|0")
 
 
 def test_rooms_on_another_grid_are_refused(rooms: Rooms) -> None:
     other = dataclasses.replace(rooms.tables, grid=PoseGrid(0.5))
     with pytest.raises(SceneError, match="on iTHOR's grid"):
-        generated.make(Rooms(other, None), KNOWN, 1, 0)
+        generated.make(Rooms(other, Extras(), records=rooms.records), KNOWN, 1, 0)
 
 
 @pytest.mark.parametrize("alone", [False, True])
@@ -101,8 +109,9 @@ def test_a_run_trains_in_generated_rooms_and_is_evaluated_as_ever(
     rooms: Rooms, monkeypatch: pytest.MonkeyPatch, alone: bool
 ) -> None:
     plain = task_in(rooms, TrainConfig(network=SMALL, validation=True))
+    assert not {"FloorPlan20", "FloorPlan30"} & {*plain.split.train_scenes}
     asked: list[tuple[tuple[str, ...], int]] = []
-    made = rooms.tables.subset(["FloorPlan5", "FloorPlan305"])
+    made = rooms.tables.subset(["FloorPlan9", "FloorPlan309"])
 
     def load(_: Rooms, known: tuple[str, ...], count: int, __: object) -> SceneTables:
         asked.append((known, count))
@@ -112,8 +121,7 @@ def test_a_run_trains_in_generated_rooms_and_is_evaluated_as_ever(
     config = TrainConfig(network=SMALL, validation=True, generated=2, generated_only=alone)
     task = task_in(rooms, config)
     # Like the rooms that validation trains in, and no others.
-    assert asked == [(make_split("18/4", True).train_scenes, 2)]
-    assert len(asked[0][0]) == 64
+    assert asked == [(KNOWN, 2)]
     chex.assert_trees_all_equal(task.eval_params, plain.eval_params)
     np.testing.assert_array_equal(task.train_params.parent_class, plain.train_params.parent_class)
     assert task.classes == plain.classes

@@ -52,7 +52,9 @@ def test_what_is_put_meets_nothing_and_cuts_nothing_off() -> None:
     assert floor.put([safe], [(0, here - (0.3, 0, 0))]) is None  # in the first
     assert floor.put([safe], [(0, here), (0, here - (0.41, 0, 0))]) is not None
     wall = toy.thing("Sofa", (0.0, 0.4, 0.0), (0.5, 0.8, 1.4))
-    assert floor.put([wall], [(0, np.zeros(3))]) is None  # half of the room would be lost
+    assert floor.put([wall], [(0, np.zeros(3))]) is None
+    empty = Floor(np.array([3.0, 1.5]), None)
+    assert empty.put([wall], [(0, np.zeros(3))]) is None  # half of the room would be lost
     assert floor.put([wall], [(1, np.array([-0.7, 0.0, 0.5]))]) is not None  # turned, at a wall
     assert len(floor.items) == 3
 
