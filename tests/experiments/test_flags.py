@@ -167,7 +167,7 @@ def prepare_scaling(recorder: Recorder) -> None:
 
 
 def prepare_scenes(recorder: Recorder) -> None:
-    tables = Tables("FloorPlan1", "FloorPlan2")
+    tables = Tables("FloorPlan1", "FloorPlan2", "FloorPlan20")
     scene = SimpleNamespace(name="FloorPlan1", points=np.zeros((9, 3)))
     recorder.record("tdanet_jax.tools.build_assets.build", gives=())
     for part in ("grid.summary", "agreement.table", "survey.uses"):
