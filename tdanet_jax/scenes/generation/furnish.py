@@ -26,8 +26,6 @@ ON_WALLS = ("Mirror", "Television", "Painting", "Poster", "TowelHolder", "HandTo
             "ToiletPaperHanger", "Shelf")  # fmt: skip
 #: What is on some of these.
 HELD = {"TowelHolder": "Towel", "HandTowelHolder": "HandTowel"}
-#: Before these, walls are free from their lower side up.
-WINDOW = "Window"
 HIGHEST = 2.6  # metres of an upper side on a wall
 DOOR = 1.0  # metres: what is free before a door
 SWITCH = 0.2  # metres from a door to its light switch
@@ -90,15 +88,15 @@ class Furnisher:
             if self.has("LightSwitch"):
                 side = (DOOR / 2 + SWITCH) * (1 if self.draw.random() < 0.5 else -1)
                 self.hang("LightSwitch", [(wall.turns, wall.at(along + side))])
-        while self.has(WINDOW):
+        while self.has("Window"):
             self._window()
 
     def _window(self) -> None:
-        window = self._hanging(WINDOW, 0.3)
+        window = self._hanging("Window", 0.3)
         (x1, y1, z1), (x2, y2, _) = window.box
         unit = [window]
         for name in ("Blinds", "Curtains"):
-            if self.has(name) and self.left[name] > self.left[WINDOW]:
+            if self.has(name) and self.left[name] > self.left["Window"]:
                 piece = self.library.choose(name, self.draw)
                 height, depth = float(piece.size[1]), float(min(piece.size[2], 0.2))
                 top, wider = (y2, 0.0) if name == "Blinds" else (min(y2 + 0.2, HIGHEST), 0.25)
@@ -287,25 +285,18 @@ class Furnisher:
 
     def scatter(self, name: str) -> Scene:
         """Small objects, on what holds their class; the room with all that is in it."""
-        floor_share = {n: self.plans.on_floor(self.plan.room_type, n) for n in sorted(self.left)}
-        for n in sorted(self.left):
-            for _ in range(max(self.left[n], 0)):
-                if self.library.flags.get(n, (False, False))[1] and (
-                    floor_share[n] > RARE and self.draw.random() < floor_share[n] and self.has(n)
-                ):
+        known = self.library.flags
+        pickupable = [n for n in sorted(self.left) if n in known and known[n][1]]
+        for n in pickupable:
+            share = self.plans.on_floor(self.plan.room_type, n)
+            for _ in range(max(self.left[n], 0) if share > RARE else 0):
+                if self.draw.random() < share and self.has(n):
                     self._drop(n)
-        for kinds in (ON_FURNITURE, None):
+        for names in (ON_FURNITURE, pickupable):
             scene = self.scene(name)
             room = Room(scene, self.usual, {}, scene.objects, self.levels)
-            small = []
-            for n in kinds or [
-                n for n in sorted(self.left) if self.library.flags.get(n, (0, 0))[1]
-            ]:
-                while self.has(n):
-                    small.append(self._small(n))
-            small.sort(
-                key=lambda item: (-float(np.prod(np.ptp(item.box, axis=0)[LEVEL])), item.object_id)
-            )
+            small = [self._small(n) for n in names for _ in range(self.left[n]) if self.has(n)]
+            small.sort(key=lambda item: (-np.prod(np.ptp(item.box, axis=0)[LEVEL]), item.object_id))
             for item in small:
                 there = room.put([item], self.draw)
                 self.floor.items += there or []
@@ -316,9 +307,8 @@ class Furnisher:
         piece = self.library.choose(name, self.draw)
         self.left[name] -= 1
         item = self.library.object(name, 1000 * next(self._ids), box_of(piece.size), self.draw)
-        slants = self.library.flags[name][1] and (name, "TowelHolder") not in self.usual.overhangs
         hangs = any(pair[0] == name for pair in self.usual.overhangs)
-        if slants and not hangs and self._slants():
+        if item.pickupable and not hangs and self._slants():
             return yawed(item, self.draw.uniform(-SLANT, SLANT))
         return item
 

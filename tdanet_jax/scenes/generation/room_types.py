@@ -48,7 +48,7 @@ def bedroom(room: Furnisher) -> bool:
     while room.has("Bed"):
         groups = [g for g in room.groups_of("Bed") if len(g) <= 1 + room.left["Pillow"]]
         tried = [*groups, (Member("Bed", -1, (0, 0), (0, 0), (0, 0), False, 0.0, (0, 0, 0)),)]
-        if not any(_put_bed(room, group) for group in tried):
+        if not any(room.put_group(group, (), ("edge", "corner")) for group in tried):
             return False
         while room.has("SideTable") and room.beside("SideTable", ["Bed"]):
             pass
@@ -132,10 +132,6 @@ def _as(member: Member, name: str, parent: int | None = None) -> Member:
     parent = member.parent if parent is None else parent
     return Member(name, parent, member.side, member.offset, member.align, member.above, member.turn,
                   member.spread)  # fmt: skip
-
-
-def _put_bed(room: Furnisher, group: tuple[Member, ...]) -> bool:
-    return room.put_group(group, (), ("edge", "corner"))
 
 
 def _toilet(room: Furnisher) -> bool:
