@@ -178,7 +178,7 @@ def check_folder(out: Path) -> None:
 def check_at_most(flag: str, value: int, most: int) -> None:
     """Fails if a flag's value is too large."""
     if value > most:
-        fail(f"--{flag} {value}: at most {most}")
+        fail(f"--{flag} {value}: at most {most:,}")
 
 
 def check_positive(**flags: int | Sequence[int]) -> None:

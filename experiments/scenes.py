@@ -3,6 +3,7 @@
 python -m experiments.scenes verify
 python -m experiments.scenes inspect FloorPlan228
 python -m experiments.scenes vary --copies 16 --out variants.npz
+python -m experiments.scenes generate --rooms 1000 --out generated.npz
 python -m experiments.scenes compare variants.npz
 python -m experiments.scenes import my_rooms.json --out my_rooms.npz
 python -m experiments.scenes import --from thor_v1_offline_data --out original.npz
@@ -34,7 +35,7 @@ from experiments.console import (
     one_line_usage,
     reporter,
 )
-from tdanet_jax.config import MOST_VARIANTS, check_seed
+from tdanet_jax.config import MOST_GENERATED, MOST_VARIANTS, check_seed
 from tdanet_jax.io import files
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.splits import UNSEEN, make_split
@@ -345,6 +346,46 @@ class Vary:
 
 
 @dataclasses.dataclass(frozen=True)
+class Generate:
+    """Writes a file of generated rooms of iTHOR's four types, furnished like the training rooms.
+
+    The same arguments give the same file, which says how it was made. To train in generated rooms,
+    use `train_zero_shot --generated` instead; it needs no file.
+    """
+
+    out: Path
+    """File to write; it must not exist."""
+    rooms: int = 100
+    """Number of rooms; the four types take turns."""
+    seed: int = 0
+    """Random seed of the rooms."""
+    validation: bool = False
+    """Makes them like the rooms that --validation trains in, without furniture of any others."""
+
+    def run(self) -> None:
+        """Writes the file."""
+        from tdanet_jax.scenes import dataset, generated
+        from tdanet_jax.scenes.checks import survey
+
+        check_positive(rooms=self.rooms)
+        check_at_most("rooms", self.rooms, MOST_GENERATED)
+        check_seed(self.seed)
+        check_new_file(self.out)
+        remove_abandoned(self.out)
+        rooms = load_rooms(None)
+        train = make_split("22/0", self.validation).train_scenes
+        known = [name for name in rooms.tables.scenes if name in train]
+        with reporter("rooms") as report:
+            made = generated.make(
+                rooms, known, self.rooms, self.seed,
+                lambda done, total: report(done / total, "generated"),
+            )  # fmt: skip
+        console.print(*survey.summary(made.tables), *survey.making(made), sep="\n")
+        dataset.save_rooms(made, self.out)
+        console.print(f"{self.out}")
+
+
+@dataclasses.dataclass(frozen=True)
 class Compare:
     """Compares rooms with the bundled training rooms: sizes, what is in view, how hard tasks are.
 
@@ -352,7 +393,7 @@ class Compare:
     """
 
     rooms: tyro.conf.Positional[str]
-    """File of rooms that `experiments.scenes vary` or `import` wrote."""
+    """File of rooms that `experiments.scenes vary`, `generate` or `import` wrote."""
     data: str | None = None
     """File of rooms to compare with, instead of the bundled ones."""
 
@@ -526,6 +567,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "verify": Verify,
     "inspect": Inspect,
     "vary": Vary,
+    "generate": Generate,
     "compare": Compare,
     "import": Import,
     "export": Export,

@@ -30,6 +30,8 @@ CONFIG_FILE = "config.json"
 WORD_VECTORS_FILE = "word_vectors.npz"
 #: Variants of a room.
 MOST_VARIANTS = 400
+#: Generated rooms.
+MOST_GENERATED = 10_000
 #: Environment variable: comma-separated modules of custom models and sensors that a run's config
 #: may import.
 TRUST = "TDANET_TRUST"
@@ -173,6 +175,13 @@ class TrainConfig:
     variants: int = 0
     """Variants of each training room to train in as well: small objects elsewhere, some left out,
     half of the variants mirrored (docs/scenes.md). They are built once and cached."""
+    generated: int = 0
+    """Generated rooms to train in as well, in all, of all four room types: like the training rooms,
+    but with furniture, layouts and sizes of their own (docs/scenes.md). They are built once and
+    cached."""
+    generated_only: bool = False
+    """Requires --generated. Train in generated rooms alone. Parents of targets and the class graph
+    are those of the training rooms in any case."""
     chunk_updates: int = 10
     """Updates per compiled call; progress is reported after each call."""
     checkpoint_minutes: float = 2.0
@@ -211,10 +220,18 @@ class TrainConfig:
                     raise ValueError(f"--{name.replace('_', '-')} {values[name]}: must {wanted}")
         if self.network.image == "features" and self.data is None:
             raise ValueError("--image features: needs --data, rooms that were imported with them")
+        if self.generated_only and not self.generated:
+            raise ValueError("--generated-only: needs --generated, the number of rooms")
+        if self.generated_only and self.variants:
+            raise ValueError("--generated-only: not with --variants, which are of other rooms")
         sense_noise.parse(self.learner.noise)
         if self.network.robust_triangulation and not self.network.triangulation:
             raise ValueError("--robust-triangulation: needs --triangulation")
         self.network.spec.check()
+
+    def in_rooms_alone(self) -> TrainConfig:
+        """The same without variants and generated rooms, which are only for training."""
+        return dataclasses.replace(self, variants=0, generated=0, generated_only=False)
 
     def normalised(self) -> TrainConfig:
         """The same run as it is saved: with the canonical name of its split, and absolute paths."""
@@ -301,7 +318,7 @@ class EvalConfig:
         return {name: value for name, value in values.items() if value}
 
     def locate(self, config: TrainConfig, run: Path | str) -> TrainConfig:
-        """A run's configuration with the files to evaluate it with, and no variants to train in.
+        """A run's configuration with the files to evaluate it with, and no rooms to train in alone.
 
         Args:
           config: the run's.
@@ -321,7 +338,7 @@ class EvalConfig:
                     "place with --data"
                 )
         words = find_word_vectors(config, run, self.word_vectors)
-        return dataclasses.replace(config, data=data, word_vectors=words, variants=0)
+        return dataclasses.replace(config.in_rooms_alone(), data=data, word_vectors=words)
 
 
 def describe_departures(departures: Mapping[str, Any]) -> str:
@@ -389,8 +406,8 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     ),
     (
         (
-            "history", "variants", "final_learning_rate", "entropy_weight", "final_entropy_weight",
-            "value_weight",
+            "history", "variants", "generated", "final_learning_rate", "entropy_weight",
+            "final_entropy_weight", "value_weight",
         ),
         lambda value: value >= 0,
         "not be negative",
@@ -407,6 +424,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     ),
     (("width", "hidden"), lambda value: value <= 8192, "be at most 8192"),
     (("variants",), lambda value: value <= MOST_VARIANTS, f"be at most {MOST_VARIANTS}"),
+    (("generated",), lambda value: value <= MOST_GENERATED, f"be at most {MOST_GENERATED:,}"),
     (("size_noise",), lambda value: 0 <= value <= 2, "be between 0 and 2"),
     (("gamma", "gae_lambda"), lambda value: 0 <= value <= 1, "be between 0 and 1"),
     (("dropout",), lambda value: 0 <= value < 1, "be at least 0 and below 1"),

@@ -24,7 +24,7 @@ from tdanet_jax.models.classes import ClassVocabulary, make_vocabulary
 from tdanet_jax.models.factory import make_model, resolve_precision
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.poses import PoseGrid
-from tdanet_jax.scenes import tabulation, variants
+from tdanet_jax.scenes import generated, tabulation, variants
 from tdanet_jax.scenes.dataset import Extras, Rooms, assign_rooms, find_targets, load_rooms
 from tdanet_jax.scenes.offline.features import features_path, load_features
 from tdanet_jax.scenes.tables import SceneTables
@@ -43,14 +43,15 @@ class Task:
       split: which rooms and classes train.
       classes: the vocabulary, and the part of it that training may know.
       model: the network.
-      train_params: the training rooms and their variants, without hidden classes.
+      train_params: the training rooms, their variants and generated rooms, without hidden classes.
       eval_params: all rooms and classes, with the test step limits; `reset` begins in the
         evaluation's rooms alone.
       train_words: [C, D], zero for hidden classes.
       words: [C, D], vectors of all classes.
       vectors: the table of word vectors that they are from.
       extras: what came with imported rooms; None with the bundled ones.
-      variants_version: hash of the tables of the variants among the training rooms; None without.
+      variants_version: hash of the tables of the variants and generated rooms among the training
+        rooms; None without.
     """
 
     tables: SceneTables
@@ -122,7 +123,7 @@ def make(
         raise ValueError(f"split {split!r}: must be 'train' or 'test'")
     config = dataclasses.replace(config or TrainConfig(), split=name.removeprefix(ITHOR))
     config.check()
-    task = load_task(config if split == "train" else dataclasses.replace(config, variants=0))
+    task = load_task(config if split == "train" else config.in_rooms_alone())
     # As many rows in training as in tests, so that networks of others can go from one to the other.
     rows = max(task.train_params.max_detections, task.eval_params.max_detections)
     params = task.train_params if split == "train" else task.eval_params
@@ -135,7 +136,8 @@ def load_task(config: TrainConfig, progress: Progress | None = None) -> Task:
     """The task of a configuration, with the rooms and word vectors that it names.
 
     Args:
-      progress: called with (rooms done, rooms in all) while bundled rooms are rebuilt, or variants.
+      progress: called with (rooms done, rooms in all) while bundled rooms are rebuilt, variants or
+        generated rooms.
 
     Raises:
       ValueError: a file is broken, or does not hold what the split needs; names the file.
@@ -147,20 +149,23 @@ def task_in(rooms: Rooms, config: TrainConfig, progress: Progress | None = None)
     """The task of a configuration in these rooms, whichever rooms it names itself.
 
     Args:
-      progress: called with (variants done, variants in all) while variants are built.
+      progress: called with (rooms done, rooms in all) while variants or generated rooms are built.
 
     Raises:
       ValueError: a file is broken, or the rooms do not hold what the split or the model needs.
     """
     vectors = word_vectors.load_word_vectors(config.word_vectors, rooms.tables.classes)
     data = None if rooms.path is None else str(rooms.path)
-    config, features, varied = resolve(dataclasses.replace(config, data=data)), None, None
+    config, features = resolve(dataclasses.replace(config, data=data)), None
     if rooms.path is not None and config.network.image == "features":
         features = load_features(rooms.path, rooms.tables)
     try:
-        if config.variants:
-            names = _split(config, rooms)[1].train_scenes
-            varied = variants.load(rooms, names, config.variants, progress)
+        added: list[SceneTables] = []
+        for kind, count in ((variants, config.variants), (generated, config.generated)):
+            if count:
+                names = _split(config, rooms)[1].train_scenes
+                added.append(kind.load(rooms, names, count, progress))
+        varied = tabulation.join(added, rooms.tables.classes) if added else None
         return make_task(config, rooms.tables, vectors, rooms.extras, features, varied)
     except ValueError as error:
         if rooms.path is None:
@@ -186,8 +191,8 @@ def make_task(
         replace those found in the training rooms. Hidden classes are in neither.
       features: [S, 512, 7, 7], ResNet-18's maps of all poses, for models that are shown an image.
         Images show hidden classes as well: nothing can be filtered out of them.
-      varied: variants of the training rooms, to train in as well. Parents and class graph are those
-        of the rooms themselves.
+      varied: variants of the training rooms and generated ones, to train in as well, or with
+        `generated_only` alone. Parents and class graph are those of the training rooms themselves.
 
     Raises:
       ValueError: there are no rooms to train or to evaluate in, a class has no word vector, or the
@@ -206,10 +211,12 @@ def make_task(
     trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]
     if varied is not None:
         if features is not None and model.encoder.maps:
-            raise ValueError("--variants: there are no feature maps of the variants")
+            flag = "--variants" if config.variants else "--generated"
+            raise ValueError(f"{flag}: there are no feature maps of these rooms")
         varied = with_targets(varied, tables.targets)
         hidden = zero_shot.hide_classes(varied, split.hidden)
-        seen_rooms = tabulation.join([seen_rooms, hidden], tables.classes)
+        own = [] if config.generated_only else [seen_rooms]
+        seen_rooms = tabulation.join([*own, hidden], tables.classes)
     train_maps, eval_maps = _feature_maps(config.model, model, features, trains, tables.grid)
     rewarded = config.learner.partial_reward
     similarity = None

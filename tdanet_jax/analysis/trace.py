@@ -93,7 +93,7 @@ def load_player(
     """
     config, weights, classes = agent.read(run)
     path = find_word_vectors(config, agent.folder_of(run), word_vectors)
-    task = task_in(rooms, dataclasses.replace(config, word_vectors=path, variants=0))
+    task = task_in(rooms, dataclasses.replace(config.in_rooms_alone(), word_vectors=path))
     task.check_known(run, classes.names)
     expected = task.model.parameter_shapes(*task.words.shape)
     history.check_fit(run, weights, expected, None if path is None else task.words.shape[1])

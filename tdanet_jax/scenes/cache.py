@@ -1,4 +1,5 @@
-"""The cache of tables, which are computed once per machine: of the bundled rooms, and of variants.
+"""The cache of tables, which are computed once per machine: of the bundled rooms, of variants
+and of generated rooms.
 
 The name of a cached file contains a hash of everything that determines it: the rooms and the
 source of the modules that compute the tables; or tables and further targets
@@ -32,9 +33,11 @@ from tdanet_jax.scenes.tables import SceneTables
 VARIABLE = "TDANET_CACHE"
 #: Files that have not been used for this long are removed when new tables are stored.
 UNUSED_DAYS = 30
-#: Prefixes of tables, of those of variants, of distances to targets that tables do not have
-#: (`target_distances`), and of the folders in which an import keeps the scenes that it has read.
-TABLES, VARIANTS, DISTANCES, IMPORTS = "ithor-", "variants-", "distances-", "import-"
+#: Prefixes of tables, of those of variants and of generated rooms, of distances to targets that
+#: tables do not have (`target_distances`), and of the folders in which an import keeps the scenes
+#: that it has read.
+TABLES, VARIANTS, GENERATED = "ithor-", "variants-", "generated-"
+DISTANCES, IMPORTS = "distances-", "import-"
 MODULES = (
     "io.archive",
     "poses",
@@ -166,7 +169,7 @@ def _remove_unused(place: Path) -> None:
     A process that reads them has them open, or computes again what it does not find.
     """
     oldest = time.time() - UNUSED_DAYS * 86400
-    kinds = [*(f"{kind}*.npz" for kind in (TABLES, VARIANTS, DISTANCES)), f"{IMPORTS}*"]
+    kinds = [*(f"{kind}*.npz" for kind in (TABLES, VARIANTS, GENERATED, DISTANCES)), f"{IMPORTS}*"]
     for path in [path for kind in kinds for path in place.glob(kind)]:
         with contextlib.suppress(OSError):
             if path.stat().st_mtime >= oldest:

@@ -60,7 +60,8 @@ class Extras:
       adjacency: [n, n] float32, the published class graph; [0, 0] without one.
       parts: room -> "train" or "test", for rooms whose scene file says it.
       targets: room type -> target classes, if the data say which they are.
-      made: how the rooms were made, if they are variants: names -> numbers and versions.
+      made: how the rooms were made, if they are variants or generated: names -> numbers and
+        versions.
     """
 
     parents: Mapping[str, Mapping[str, Mapping[str, float]]] = dataclasses.field(

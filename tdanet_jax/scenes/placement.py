@@ -122,8 +122,13 @@ def is_closed(item: SceneObject) -> bool:
     return item.object_class in RULES.closed and not item.is_open
 
 
-def statistics(scenes: Sequence[Scene]) -> Statistics:
-    """What lies where in these rooms: training rooms alone, for rooms to train in."""
+def statistics(scenes: Sequence[Scene], others: Collection[str] = ()) -> Statistics:
+    """What lies where in these rooms: training rooms alone, for rooms to train in.
+
+    Args:
+      others: classes that stand on furniture as small objects do, although they cannot be picked
+        up.
+    """
     holds: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     rests: dict[str, list[tuple[float, float, float, float]]] = defaultdict(list)
     stuck_out: dict[tuple[str, str], list[bool]] = defaultdict(list)
@@ -131,7 +136,8 @@ def statistics(scenes: Sequence[Scene]) -> Statistics:
         support = supports(scene)
         for item in scene.objects:
             below = support.get(item.object_id)
-            if not item.pickupable or below is None or below.pickupable or is_closed(below):
+            small = item.pickupable or item.object_class in others
+            if not small or below is None or below.pickupable or is_closed(below):
                 continue
             holds[room_kind(scene), item.object_class][below.object_class] += 1
             margin = float(
@@ -211,9 +217,16 @@ class Room:
         known: Statistics,
         support: Mapping[str, SceneObject],
         there: Sequence[SceneObject],
+        levels: Mapping[str, Sequence[float]] | None = None,
     ) -> None:
-        """`there` are the objects that stay in their places, whatever the scene has besides."""
+        """`there` are the objects that stay in their places, whatever the scene has besides.
+
+        Args:
+          levels: id of a receptacle -> heights (y) at which things lie on it, if they are not those
+            that are usual for its class.
+        """
         self._scene = scene
+        self._levels = {} if levels is None else levels
         self._known = known
         self._support = support
         self._there = [item for item in there if np.isfinite(item.box).all()]
@@ -243,8 +256,9 @@ class Room:
             near = (h for h in heights if abs(h - item.box[0, 1]) < SAME)
             heights[next(near, float(item.box[0, 1]))].append(item)
         usual = rest.level(receptacle)
-        if usual is not None and not any(abs(height - usual) < SAME for height in heights):
-            heights[usual] = []
+        for level in self._levels.get(receptacle.object_id, () if usual is None else (usual,)):
+            if not any(abs(height - level) < SAME for height in heights):
+                heights[level] = []
         return [self._surface(receptacle, rest, *level) for level in heights.items()]
 
     def _surface(
@@ -254,13 +268,13 @@ class Room:
         area = receptacle.box[:, LEVEL] + margin
         usual = rest.level(receptacle)
         flat = abs(height - receptacle.box[1, 1]) < 2 * SAME
-        turned = abs((receptacle.rotation[1] + 45) % 90 - 45) > TURNED
+        oblique = abs((receptacle.rotation[1] + 45) % 90 - 45) > TURNED
         as_usual = usual is not None and abs(height - usual) < SAME
-        if lying and (turned or not (flat or as_usual)):
+        if lying and (oblique or not (flat or as_usual)):
             boxes = np.array([item.box[:, LEVEL] for item in lying])
             around = np.stack([boxes[:, 0].min(axis=0) - AROUND, boxes[:, 1].max(axis=0) + AROUND])
             area = np.stack([np.maximum(area[0], around[0]), np.minimum(area[1], around[1])])
-        elif turned:  # the middle of the box is on the receptacle, however it is turned
+        elif oblique:  # the middle of the box is on the receptacle, however it is turned
             area = area + np.array([[1], [-1]]) * (area[1] - area[0]) / 4
         sides = receptacle.box[1, LEVEL] - receptacle.box[0, LEVEL]
         square = abs(sides[0] - sides[1]) < ROUND * sides.max()
@@ -270,10 +284,20 @@ class Room:
         self, unit: Sequence[SceneObject], draw: np.random.Generator
     ) -> list[SceneObject] | None:
         """An object and its contents in a new place, which is then taken; None if it has none."""
-        found = self._find(unit, draw)
+        found = self.put(unit, draw) if unit[0].object_id in self._support else None
         if found is None and self._free(_around(unit)[None], None).all():
             found = [*unit]
-        if found is not None:
+            self._there += unit
+        return found
+
+    def put(
+        self, unit: Sequence[SceneObject], draw: np.random.Generator
+    ) -> list[SceneObject] | None:
+        """An object that is nowhere yet and its contents, on a receptacle; None if none has room.
+
+        Its place is then taken.
+        """
+        if (found := self._find(unit, draw)) is not None:
             self._there += found
         return found
 
@@ -292,12 +316,12 @@ class Room:
                     if surface.receptacle.object_class == name
                     and (
                         not self._overhangs(item, name)
-                        or _turns(below, surface.receptacle) is not None
+                        or _turns(item, below, surface.receptacle) is not None
                     )
                 ]
             )
         }
-        if below is None or not options:
+        if not options:
             return None
         names, weights = [*options], np.array([counts[name] for name in options])
         for _ in range(DRAWS):
@@ -306,13 +330,13 @@ class Room:
             ]
             surface = options[name][draw.integers(len(options[name]))]
             out = self._overhangs(item, name)
-            turns = draw.integers(4) if not out else _turns(below, surface.receptacle) or 0
-            turned = [_turned(other, int(turns), item.box.mean(axis=0)) for other in unit]
-            shift = self._spot(turned, surface, out, draw.random((SPOTS, 2)))
+            turns = draw.integers(4) if not out else _turns(item, below, surface.receptacle) or 0
+            there = [turned(other, int(turns), item.box.mean(axis=0)) for other in unit]
+            shift = self._spot(there, surface, out, draw.random((SPOTS, 2)))
             if shift is not None:
                 rest = (surface.receptacle.object_id,)
-                first = dataclasses.replace(shifted(turned[0], shift), parents=rest)
-                return [first, *(shifted(other, shift) for other in turned[1:])]
+                first = dataclasses.replace(shifted(there[0], shift), parents=rest)
+                return [first, *(shifted(other, shift) for other in there[1:])]
         return None
 
     def _overhangs(self, item: SceneObject, receptacle: str) -> bool:
@@ -380,7 +404,7 @@ def shifted(item: SceneObject, shift: np.ndarray) -> SceneObject:
     )
 
 
-def _turned(item: SceneObject, turns: int, centre: np.ndarray) -> SceneObject:
+def turned(item: SceneObject, turns: int, centre: np.ndarray) -> SceneObject:
     """An object turned clockwise by quarters about the vertical through `centre` [3]."""
     for _ in range(turns % 4):
         x, y, z = item.rotation
@@ -400,9 +424,15 @@ def _quarter(places: np.ndarray, centre: np.ndarray) -> np.ndarray:
     return np.stack([z, y, -x], axis=1) + centre
 
 
-def _turns(below: SceneObject | None, other: SceneObject) -> int | None:
-    """Quarters from one receptacle to another of its class; None between other ones."""
-    if below is None or below.object_class != other.object_class:
+def _turns(item: SceneObject, below: SceneObject | None, other: SceneObject) -> int | None:
+    """Quarters from one receptacle to another of its class; None between other ones.
+
+    What is nowhere yet is turned along its receptacle.
+    """
+    if below is None:
+        lies, goes = (np.ptp(box[:, LEVEL], axis=0) for box in (item.box, other.box))
+        return int((lies[0] > lies[1]) != (goes[0] > goes[1]))
+    if below.object_class != other.object_class:
         return None
     turn = (other.rotation[1] - below.rotation[1]) / 90
     return round(turn) % 4 if abs(turn - round(turn)) * 90 < TURNED else None

@@ -66,19 +66,18 @@ def build(
         raise SceneError(f"{len(scenes)} rooms, more than {MOST_ROOMS}")
     shares = np.zeros(len(scenes))  # of each room, done
 
-    def build_room(number: int) -> SceneTables:
+    def build_one(number: int) -> SceneTables:
         scene = scenes[number]
         for item in scene.objects:
             if item.object_class not in names:
                 raise SceneError(
                     f"{scene.name}: {item.object_id}: class {item.object_class} is not known"
                 )
-        ahead = next_positions(scene.points, scene.grid)
 
         def note(share: float) -> None:
             shares[number] = share
 
-        room = tabulate(scene, ahead, detect(scene, rules, report=note), targets)
+        room = build_room(scene, targets, rules, note)
         note(1.0)
         return room
 
@@ -88,7 +87,7 @@ def build(
 
     rooms = []
     with ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, MOST_WORKERS)) as pool:
-        futures = [pool.submit(build_room, number) for number in range(len(scenes))]
+        futures = [pool.submit(build_one, number) for number in range(len(scenes))]
         try:
             for future in futures:
                 while wait([future], SECONDS_BETWEEN_REPORTS).not_done:
@@ -98,6 +97,21 @@ def build(
         finally:
             pool.shutdown(cancel_futures=True)
     return join(rooms, names)
+
+
+def build_room(
+    scene: Scene,
+    targets: Sequence[str] = ALL_TARGETS,
+    rules: Rules = RULES,
+    report: Callable[[float], None] | None = None,
+) -> SceneTables:
+    """The tables of one room, with its own classes.
+
+    Args:
+      report: called with the share of the points that is done.
+    """
+    ahead = next_positions(scene.points, scene.grid)
+    return tabulate(scene, ahead, detect(scene, rules, report=report), targets)
 
 
 def tabulate(

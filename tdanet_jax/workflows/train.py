@@ -136,8 +136,10 @@ def resumed(folder: Path | str, new: TrainConfig | None = None) -> TrainConfig:
 def _located(config: TrainConfig, folder: Path) -> TrainConfig:
     """The configuration of a new run, or of one that has begun, with the files that are there."""
     begun = (folder / CONFIG_FILE).exists()
-    located = OWN_TASK.locate(config, folder) if begun else config
-    return dataclasses.replace(located, variants=config.variants)
+    if not begun:
+        return config
+    located = OWN_TASK.locate(config, folder)
+    return dataclasses.replace(config, data=located.data, word_vectors=located.word_vectors)
 
 
 def _check_new(folder: Path) -> None:

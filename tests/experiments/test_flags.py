@@ -167,7 +167,7 @@ def prepare_scaling(recorder: Recorder) -> None:
 
 
 def prepare_scenes(recorder: Recorder) -> None:
-    tables = Tables("FloorPlan1", "FloorPlan2")
+    tables = Tables("FloorPlan1", "FloorPlan2", "FloorPlan20")
     scene = SimpleNamespace(name="FloorPlan1", points=np.zeros((9, 3)))
     recorder.record("tdanet_jax.tools.build_assets.build", gives=())
     for part in ("grid.summary", "agreement.table", "survey.uses"):
@@ -190,6 +190,7 @@ def prepare_scenes(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.scenes.vary.vary", gives="a variant")
     recorder.record("tdanet_jax.analysis.pictures.plans", gives=Ended)
     recorder.record("tdanet_jax.scenes.variants.make", gives=rooms)
+    recorder.record("tdanet_jax.scenes.generated.make", gives=rooms)
     recorder.record("tdanet_jax.scenes.checks.survey.making", gives=())
     recorder.record("tdanet_jax.evaluation.room_statistics.table", gives=Ended)
     recorder.record("tdanet_jax.scenes.dataset.load_rooms", gives=rooms)
@@ -404,6 +405,15 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--data": "--data rooms.npz",
         },
     ),
+    "scenes generate": (
+        "--out new.npz",
+        {
+            "--out": ("--out new.npz", "--out newer.npz"),
+            "--rooms": "--rooms 2",
+            "--seed": "--seed 2",
+            "--validation": "--validation",
+        },
+    ),
     "scenes compare": ("rooms.npz", {"--data": "--data others.npz"}),
     "scenes import": (
         "--from folder",
@@ -512,6 +522,10 @@ SHOWN = {
     "episodes": "training/test_run.py::test_the_budget_in_episodes_ends_the_run",
     "targets": "test_targets.py::test_any_target_can_be_unseen",
     "variants": "scenes/test_variants.py::test_a_run_trains_in_variants_and_is_evaluated_as_ever",
+    "generated": "scenes/test_generated.py::test_a_run_trains_in_generated_rooms_and_is_evaluated_"
+    "as_ever",
+    "generated_only": "scenes/test_generated.py::test_a_run_trains_in_generated_rooms_and_is_"
+    "evaluated_as_ever",
     "minutes": "training/test_run_bookkeeping.py::test_time_and_rows_continue",
     "seed": "training/test_run.py::test_another_seed_gives_another_run",
     "validation": "test_splits.py::test_validation_touches_neither_test_rooms_nor_unseen_classes",

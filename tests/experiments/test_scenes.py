@@ -289,6 +289,21 @@ def test_export_says_what_it_leaves_out(tmp_path: Path, capsys: pytest.CaptureFi
     assert "Left out" not in capsys.readouterr().out
 
 
+def test_generated_rooms_are_written_and_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scenes.main(
+        ["generate", "--rooms", "2", "--seed", "3", "--validation", "--out", "generated.npz"]
+    )
+    said = capsys.readouterr().out
+    assert "2 rooms, " in said
+    assert "Targets visible from nowhere in a room that holds them: 0" in said
+    assert "Made by command generate, rooms 2, seed 3, known 64 rooms, source " in said
+    scenes.main(["inspect", "living_room-0001", "--data", "generated.npz", "--out", "room.png"])
+    assert Path("room.png").stat().st_size > 10_000
+
+
 @pytest.mark.slow
 def test_variants_are_written_compared_and_drawn(
     ithor: SceneTables,

@@ -15,6 +15,7 @@ from tdanet_jax.evaluation import episodes
 from tdanet_jax.io import assets
 from tdanet_jax.io.assets import AssetError
 from tdanet_jax.scenes import ithor
+from tdanet_jax.scenes.generation import catalogue
 from tdanet_jax.splits import OPEN_ASSET
 from tdanet_jax.tools import build_assets
 from tests.support import toy
@@ -109,7 +110,7 @@ def test_bundled_files_are_replaced_when_all_new_ones_are_whole(
 ) -> None:
     def make(name: str) -> Any:
         def write(*given: Any) -> Path:
-            folder = given[-2] if name == words.ASSET else given[-1]
+            [folder] = (one for one in given if isinstance(one, Path) and one.is_dir())
             if fails and name == words.ASSET:
                 raise KeyboardInterrupt
             (folder / name).write_text("new")
@@ -119,7 +120,7 @@ def test_bundled_files_are_replaced_when_all_new_ones_are_whole(
 
     monkeypatch.setattr(build_assets, "fetch", lambda source, folder: folder / source.wheel)
     monkeypatch.setattr(build_assets, "notice_text", lambda wheels: "new")
-    for module in (ithor, labels, words, episodes):
+    for module in (ithor, catalogue, labels, words, episodes):
         monkeypatch.setattr(module, "build_asset", make(module.ASSET))
     monkeypatch.setattr(words, "load_bundled", lambda path: path.read_text())
     monkeypatch.setattr(build_assets.open_split, "build_asset", make(OPEN_ASSET))

@@ -283,12 +283,12 @@ def test_an_object_is_turned_with_its_corners_and_keeps_its_size() -> None:
     corners = np.array([(0, 0, 0), (0.4, 0, 0), (0.4, 0, 0.2), (0, 0, 0.2)])
     corners = np.concatenate([corners, corners + np.array([0, 0.1, 0])])
     item = SceneObject("Book|1", "Book", box, corners, (0.0, 300.0, 0.0))
-    turned = placement._turned(item, 1, box.mean(axis=0))
+    turned = placement.turned(item, 1, box.mean(axis=0))
     np.testing.assert_allclose(turned.box, [(0.1, 0, -0.1), (0.3, 0.1, 0.3)], atol=1e-9)
     assert turned.rotation == (0.0, 30.0, 0.0)
     assert turned.corners is not None
     np.testing.assert_allclose(turned.corners.min(axis=0), turned.box[0], atol=1e-9)
     # Clockwise from above: what pointed along +x points along -z.
     np.testing.assert_allclose(turned.corners[1] - turned.corners[0], (0, 0, -0.4), atol=1e-9)
-    whole = placement._turned(item, 4, box.mean(axis=0))
+    whole = placement.turned(item, 4, box.mean(axis=0))
     np.testing.assert_array_equal(whole.box, item.box)

@@ -98,7 +98,7 @@ def summary(tables: SceneTables) -> Iterator[str]:
 
 
 def making(rooms: Rooms) -> Iterator[str]:
-    """A line on how the rooms were made, if they are variants."""
+    """A line on how the rooms were made, if they are variants or generated."""
     if rooms.extras is not None and rooms.extras.made:
         yield "Made by " + ", ".join(f"{name} {value}" for name, value in rooms.extras.made.items())
 

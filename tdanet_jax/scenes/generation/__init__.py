@@ -1,0 +1,1 @@
+"""Rooms that are generated: models of furniture, plans, and putting one into the other."""
