@@ -14,7 +14,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Annotated, Any, NoReturn, TypeVar
 
 import tyro
 from rich.console import Console
@@ -23,6 +23,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from experiments.signals import Stopped, StopRequest
 from experiments.streams import ends_with_its_reader
 from tdanet_jax.io import files
+from tdanet_jax.io.bundled_agents import find_run
 from tdanet_jax.io.escaping import in_line, in_terminal
 from tdanet_jax.splits import GROUPS
 
@@ -94,6 +95,19 @@ def _whole_numbers(
         is_instance=lambda value: isinstance(value, int),
         str_from_instance=lambda value: [str(value)],
     )
+
+
+#: A flag that says where a run is: its folder, a point of its history, or a bundled agent's name.
+RunPath = Annotated[
+    Path,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="RUN",
+        instance_from_str=lambda words: find_run(words[0]),
+        is_instance=lambda value: isinstance(value, Path),
+        str_from_instance=lambda value: [str(value)],
+    ),
+]
 
 
 def whole_number(text: str) -> int:
