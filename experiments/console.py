@@ -20,10 +20,11 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+import experiments
 from experiments.signals import Stopped, StopRequest
 from experiments.streams import ends_with_its_reader
 from tdanet_jax.io import files
-from tdanet_jax.io.bundled_agents import find_run
+from tdanet_jax.io.bundled_agents import find_run, is_bundled
 from tdanet_jax.io.escaping import in_line, in_terminal
 from tdanet_jax.splits import GROUPS
 
@@ -127,6 +128,8 @@ def whole_number(text: str) -> int:
 
 def parse(command: type[Arguments], arguments: Sequence[str] | None, **options: Any) -> Arguments:
     """`tyro.cli`, with errors in one line."""
+    if experiments.subcommand is not None:
+        options["prog"] = f"tdanet {experiments.subcommand}"
     with one_line_usage():
         return tyro.cli(command, args=arguments, **options)
 
@@ -152,6 +155,11 @@ def one_line_errors() -> Iterator[None]:
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
     print(f"warning: {in_line(message)}", file=sys.stderr)
+
+
+def folder_for(run: Path) -> Path:
+    """Where what is made of a run goes by default: its folder, or runs/<name> if it is bundled."""
+    return Path("runs") / run.name if is_bundled(run) else run
 
 
 def check_new_file(path: Path, in_folder: bool = True) -> None:

@@ -18,7 +18,6 @@ from experiments.console import RunPath, check_file, console, fail, one_line_err
 from experiments.one_episode import Choice
 from tdanet_jax.io.bundled_agents import find_run
 
-
 #: A task has rooms to train in and rooms to be tested in; these two are computed in no time.
 SMALL_ROOMS = ("FloorPlan401", "FloorPlan428")
 
@@ -27,7 +26,7 @@ SMALL_ROOMS = ("FloorPlan401", "FloorPlan428")
 class Command:
     """Shows the bundled agent finding something: writes a page and opens it."""
 
-    checkpoint: RunPath = find_run("18-4-best")
+    checkpoint: RunPath = Path("18-4-best")
     """A bundled agent, or the folder of a run."""
     scene: str = "FloorPlan228"
     """One of the 120 iTHOR rooms."""
@@ -46,10 +45,10 @@ def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
         command = parse(Command, arguments, prog="demo", description=__doc__)
+        command = dataclasses.replace(command, checkpoint=find_run(command.checkpoint))
         choice = Choice(scene=command.scene, target=command.target, seed=command.seed)
         one_episode.check(choice, [command.checkpoint])
         check_file(command.out)
-        console.print(f"{command.checkpoint.name}: looks for {command.target} ...")
         show(command, choice)
         if command.show:
             webbrowser.open(command.out.resolve().as_uri())
@@ -69,6 +68,7 @@ def show(command: Command, choice: Choice) -> None:
     scenes = {scene.name: scene for scene in ithor.load_scenes()}
     if command.scene not in scenes:
         fail(f"--scene {command.scene}: no such room; there are {name_ranges([*scenes])}")
+    console.print(f"{command.checkpoint.name} looks for {command.target} ...")
     names = dict.fromkeys((command.scene, *SMALL_ROOMS))
     classes = {item.object_class for scene in scenes.values() for item in scene.objects}
     tables = tabulation.build([scenes[name] for name in names], sorted(classes))
