@@ -1,4 +1,4 @@
-"""One file per command: `python -m experiments.NAME`."""
+"""One file per command: `python -m experiments.NAME`; `tdanet NAME` where it is installed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import os
 import signal
 import sys
 
+#: The command's name if it was started as `tdanet NAME`.
+subcommand: str | None = None
 #: Exit status of a command that was stopped by a signal and has cleaned up.
 exit_status: int | None = None
 
@@ -24,12 +26,17 @@ def _leave() -> None:
         os._exit(exit_status)
 
 
-if sys.argv[0] == "-m":
+def begin() -> None:
+    """Begins a command in a process of its own, before anything large is imported."""
     # Where output is closed (>&-), it goes nowhere; libraries expect that it is there.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    # A command starts here. Until `console.one_line_errors` there is nothing to clean up after a
-    # signal: Ctrl-C acts at once, as SIGTERM does.
+    # Until `console.one_line_errors` there is nothing to clean up after a signal: Ctrl-C acts at
+    # once, as SIGTERM does.
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     atexit.register(_leave)
+
+
+if sys.argv[0] == "-m":
+    begin()

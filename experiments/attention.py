@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING
 import tyro
 
 from experiments import one_episode
-from experiments.console import check_folder, console, fail, one_line_errors, parse
+from experiments.console import (
+    RunPath,
+    check_folder,
+    console,
+    fail,
+    folder_for,
+    one_line_errors,
+    parse,
+)
 from experiments.one_episode import Choice
 
 if TYPE_CHECKING:
@@ -33,8 +41,8 @@ Played = Mapping[str, tuple["Episodes", "Records"]]
 class Command:
     """Shows what a trained agent attends to."""
 
-    checkpoint: Path
-    """Folder of a run."""
+    checkpoint: RunPath
+    """Folder of a run, or a bundled agent's name."""
     choice: tyro.conf.OmitArgPrefixes[Choice]
     out: Path | None = None
     """Folder to write; by default <run>/attention-<policy>, or <run>/attention-<policy>-<updates>
@@ -82,7 +90,7 @@ def show(command: Command) -> None:
 def default_folder(command: Command) -> Path:
     """The default of --out: one folder for each network and policy."""
     point = f"-{command.checkpoint.stem}" if command.checkpoint.suffix == ".npz" else ""
-    folder = one_episode.folder_of(command.checkpoint)
+    folder = folder_for(one_episode.folder_of(command.checkpoint))
     return folder / f"attention-{command.choice.policy}{point}"
 
 

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 from rich.table import Table
 
-from experiments.console import check_positive, console, fail, one_line_errors, parse
+from experiments.console import RunPath, check_positive, console, fail, one_line_errors, parse
 from tdanet_jax.config import NetworkConfig, TrainConfig
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Command:
     """Precision of the matrix products in the `rollout` and `update` parts."""
     networks: tuple[int, ...] = (1,)
     """Numbers of networks that are evaluated in one call; 20 is a run's history."""
-    checkpoint: Path | None = None
+    checkpoint: RunPath | None = None
     """Run whose trained network the `evaluation` part plays; by default an untrained one."""
     models: tuple[str, ...] = ("tdanet",)
     """Models of the `rollout`, `update` and `decision` parts."""

@@ -14,15 +14,17 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Annotated, Any, NoReturn, TypeVar
 
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+import experiments
 from experiments.signals import Stopped, StopRequest
 from experiments.streams import ends_with_its_reader
 from tdanet_jax.io import files
+from tdanet_jax.io.bundled_agents import find_run, is_bundled
 from tdanet_jax.io.escaping import in_line, in_terminal
 from tdanet_jax.splits import GROUPS
 
@@ -96,6 +98,19 @@ def _whole_numbers(
     )
 
 
+#: A flag that says where a run is: its folder, a point of its history, or a bundled agent's name.
+RunPath = Annotated[
+    Path,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="RUN",
+        instance_from_str=lambda words: find_run(words[0]),
+        is_instance=lambda value: isinstance(value, Path),
+        str_from_instance=lambda value: [str(value)],
+    ),
+]
+
+
 def whole_number(text: str) -> int:
     """An integer as people type it: 1000000, 1_000_000, 1e6, 1.5e6.
 
@@ -113,6 +128,8 @@ def whole_number(text: str) -> int:
 
 def parse(command: type[Arguments], arguments: Sequence[str] | None, **options: Any) -> Arguments:
     """`tyro.cli`, with errors in one line."""
+    if experiments.subcommand is not None:
+        options["prog"] = f"tdanet {experiments.subcommand}"
     with one_line_usage():
         return tyro.cli(command, args=arguments, **options)
 
@@ -138,6 +155,11 @@ def one_line_errors() -> Iterator[None]:
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
     print(f"warning: {in_line(message)}", file=sys.stderr)
+
+
+def folder_for(run: Path) -> Path:
+    """Where what is made of a run goes by default: its folder, or runs/<name> if it is bundled."""
+    return Path("runs") / run.name if is_bundled(run) else run
 
 
 def check_new_file(path: Path, in_folder: bool = True) -> None:

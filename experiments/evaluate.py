@@ -20,7 +20,16 @@ from typing import Annotated, Literal
 
 import tyro
 
-from experiments.console import console, fail, one_line_errors, parse, print_summary, reporter
+from experiments.console import (
+    RunPath,
+    console,
+    fail,
+    folder_for,
+    one_line_errors,
+    parse,
+    print_summary,
+    reporter,
+)
 from tdanet_jax.config import OWN_TASK, EvalConfig, TrainConfig
 from tdanet_jax.io import files
 from tdanet_jax.sense_noise import SWEEP, SWEEP_FILE
@@ -30,9 +39,9 @@ from tdanet_jax.sense_noise import SWEEP, SWEEP_FILE
 class Command:
     """Evaluates trained agents or untrained policies on the fixed test episodes."""
 
-    checkpoint: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
-    """Folder of a run; its newest checkpoint is evaluated. Repeat the flag for more runs: they are
-    played in one compiled call and reported together."""
+    checkpoint: Annotated[tuple[RunPath, ...], tyro.conf.UseAppendAction] = ()
+    """Folder of a run, whose newest checkpoint is evaluated, or a bundled agent's name. Repeat the
+    flag for more runs: they are played in one compiled call and reported together."""
     history: bool = False
     """Evaluate the whole history of each run instead of its newest checkpoint, and draw the
     learning curve."""
@@ -50,7 +59,8 @@ class Command:
     out: Path | None = None
     """Folder to write; must be new or empty. By default <checkpoint>/<policy> for one checkpoint,
     <checkpoint>/history-<policy> for its history, <checkpoint>/noise-<policy> for a sweep over
-    noise, runs/<policy> without one. A sweep over noise continues in its folder."""
+    noise, runs/<policy> without one; of a bundled agent, in runs/<name>. A sweep over noise
+    continues in its folder."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -85,7 +95,7 @@ def main(arguments: list[str] | None = None) -> None:
         test.check()
         kind = f"noise-{command.policy}" if sweep else command.policy
         kind = f"history-{command.policy}" if command.history else kind
-        folder = command.out or (*command.checkpoint, Path("runs"))[0] / kind
+        folder = command.out or (*map(folder_for, command.checkpoint), Path("runs"))[0] / kind
         if sweep and (folder / SWEEP_FILE).is_file():
             files.check_writable(folder)  # it continues
         else:

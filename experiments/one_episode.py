@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from experiments.console import console, fail, reporter
+from experiments.console import RunPath, console, fail, reporter
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, EvalConfig
 from tdanet_jax.poses import TURNS
@@ -54,8 +54,8 @@ class Choice:
 class Comparison:
     """Flags of the commands that show several agents in the same episode."""
 
-    checkpoint: tyro.conf.UseAppendAction[tuple[Path, ...]]
-    """Folder of a run; repeat the flag to compare several."""
+    checkpoint: tyro.conf.UseAppendAction[tuple[RunPath, ...]]
+    """Folder of a run, or a bundled agent's name; repeat the flag to compare several."""
     choice: tyro.conf.OmitArgPrefixes[Choice]
     shortest: bool = False
     """Also shows the shortest path."""

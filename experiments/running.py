@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
+import experiments
 from experiments.console import console, parse, print_summary, reporter
 from experiments.signals import Stopped, StopRequest
 from tdanet_jax.config import CONFIG_FILE, PRESETS, TRUST, TrainConfig
@@ -145,5 +146,6 @@ def how_to_continue(folder: Path, config: TrainConfig) -> str:
 
     if not (folder / CONFIG_FILE).exists():
         return "the run had not begun"
-    again = f"{trust(config)} python -m experiments.train_zero_shot --resume {folder}".lstrip()
+    name = "tdanet train" if experiments.subcommand else "python -m experiments.train_zero_shot"
+    again = f"{trust(config)} {name} --resume {folder}".lstrip()
     return f"{Checkpoints(folder).latest() or 0:,} updates are saved; continue with: {again}"

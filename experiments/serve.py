@@ -22,7 +22,7 @@ from typing import BinaryIO
 
 import tyro
 
-from experiments.console import one_line_errors, parse
+from experiments.console import RunPath, one_line_errors, parse
 from tdanet_jax.agent.camera import Camera
 from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
 
@@ -34,8 +34,8 @@ LONGEST = 1 << 20
 class Command:
     """Answers frames with actions: one JSON frame a line in, one JSON action a line out."""
 
-    checkpoint: Path
-    """Folder of a run, or a point of its history."""
+    checkpoint: RunPath
+    """Folder of a run, a point of its history, or a bundled agent's name."""
     navigator: tyro.conf.OmitArgPrefixes[NavigatorConfig]
     hfov: float | None = None
     """Horizontal field of view of the camera, in degrees; by default boxes are taken to be those of

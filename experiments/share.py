@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from experiments.console import console, one_line_errors, parse
+from experiments.console import RunPath, console, one_line_errors, parse
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, WORD_VECTORS_FILE
 from tdanet_jax.io import files
@@ -23,8 +23,8 @@ from tdanet_jax.io import files
 class Command:
     """Makes a small folder of a trained agent."""
 
-    checkpoint: Path
-    """Folder of a run."""
+    checkpoint: RunPath
+    """Folder of a run, or a bundled agent's name."""
     out: Path
     """Folder to write; must be new or empty."""
     word_vectors: Path | None = None

@@ -21,6 +21,7 @@ from tdanet_jax import words
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors
 from tdanet_jax.env.types import Observation
+from tdanet_jax.io.bundled_agents import find_run
 from tdanet_jax.labels import LabelError, Labels, Synonyms
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
@@ -376,7 +377,8 @@ def load(
     """The agent of a run's newest checkpoint, or of a point of its history. Needs no rooms.
 
     Args:
-      run: the run's folder, or a file `history/<updates>.npz` in it.
+      run: the run's folder, or a file `history/<updates>.npz` in it; or the name of a bundled
+        agent, "18-4-best".
       grid: the turns and steps of the world in which the agent acts, if it has sensors; it may
         have been trained on another.
       word_vectors: file of word vectors in place of the run's copy, for example with more words;
@@ -386,6 +388,7 @@ def load(
       ValueError: the folder holds no run, its checkpoint cannot be read, or its word vectors are
         missing or of another width.
     """
+    run = find_run(run)
     config, weights, classes = read(run)
     path = find_word_vectors(config, folder_of(run), word_vectors)
     vectors = words.load_word_vectors(path, classes.names)

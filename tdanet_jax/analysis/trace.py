@@ -25,6 +25,7 @@ from tdanet_jax.evaluation import policies, rollout
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.policies import Policy
 from tdanet_jax.evaluation.rollout import Records
+from tdanet_jax.io.bundled_agents import find_run
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.scenes import camera_view
@@ -79,7 +80,8 @@ def load_player(
     """The agent of a training run, or of a point of its history, on the given rooms.
 
     Args:
-      run: the run's folder, or a file `history/<updates>.npz` in it.
+      run: the run's folder, or a file `history/<updates>.npz` in it; or the name of a bundled
+        agent.
       rooms: where it plays.
       greedy: take the most probable action instead of sampling one.
       word_vectors: file of word vectors in place of the run's copy.
@@ -91,6 +93,7 @@ def load_player(
       ValueError: the folder holds no run, its checkpoint cannot be read, the network needs feature
         maps that the rooms do not have, or it knows classes by index and the rooms have others.
     """
+    run = find_run(run)
     config, weights, classes = agent.read(run)
     path = find_word_vectors(config, agent.folder_of(run), word_vectors)
     task = task_in(rooms, dataclasses.replace(config.in_rooms_alone(), word_vectors=path))

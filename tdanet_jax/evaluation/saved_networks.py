@@ -21,6 +21,7 @@ from tdanet_jax.config import CONFIG_FILE, OWN_TASK, WORD_VECTORS_FILE, EvalConf
 from tdanet_jax.evaluation import comparison, policies, report, rollout, selection
 from tdanet_jax.evaluation.report import Played
 from tdanet_jax.io import assets, files
+from tdanet_jax.io.bundled_agents import find_run
 from tdanet_jax.io.untrusted import regular
 from tdanet_jax.models import classes
 from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
@@ -91,14 +92,14 @@ def find(
     """The newest network of a run, or its whole history, oldest first.
 
     Args:
-      run: its folder.
+      run: its folder, or the name of a bundled agent.
       with_history: all points of its history.
       test: how to evaluate them.
 
     Raises:
       ValueError: the folder holds no run, or none of its networks.
     """
-    run = Path(run)
+    run = find_run(run)
     test = test or OWN_TASK
     config = configs.load(run / CONFIG_FILE)
     if with_history:
@@ -127,7 +128,7 @@ def share(run: Path | str, out: Path | str, word_vectors: Path | str | None = No
       ValueError: the folder holds no run, its network cannot be read or does not fit, or its word
         vectors are missing.
     """
-    run, out = Path(run), Path(out)
+    run, out = find_run(run), Path(out)
     network, vocabulary = find(run)[0], classes.load_vocabulary(run)
     snapshot = network.load()
     path = configs.find_word_vectors(network.config, run, word_vectors)

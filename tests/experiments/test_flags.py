@@ -234,6 +234,7 @@ PREPARE: dict[str, Callable[[Recorder], None]] = {
     "train_zero_shot": lambda r: r.record("tdanet_jax.workflows.train.train"),
     "evaluate": lambda r: r.record("tdanet_jax.workflows.evaluate.evaluate", gives=Ended),
     "share": lambda r: r.record("tdanet_jax.evaluation.saved_networks.share", gives=Ended),
+    "demo": lambda r: r.record("experiments.demo.show", "webbrowser.open", gives=None),
     "serve": prepare_serve,
     "replay": lambda r: agents(r, "tdanet_jax.io.files.write_text"),
     "trajectories": lambda r: agents(r, "tdanet_jax.analysis.pictures.trajectories"),
@@ -297,6 +298,17 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
                 "--checkpoint run --out new",
                 "--checkpoint run --out new --word-vectors words.txt",
             ),
+        },
+    ),
+    "demo": (
+        "",
+        {
+            "--checkpoint": ("--checkpoint run", "--checkpoint other"),
+            "--scene": "--scene FloorPlan1",
+            "--target": "--target Vase",
+            "--seed": "--seed 5",
+            "--out": "--out new.html",
+            "--show": "--no-show",
         },
     ),
     "serve": (

@@ -1,0 +1,37 @@
+"""The agents that come with the package, by name. Imports no JAX."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def folder() -> Path:
+    """Their folder: inside an installed package, or next to it in a checkout."""
+    inside = _PACKAGE / "assets" / "agents"
+    return inside if inside.is_dir() else _PACKAGE.parent / "agents"
+
+
+def names() -> list[str]:
+    """Their names."""
+    return sorted(path.parent.name for path in folder().glob("*/config.json"))
+
+
+def find_run(run: Path | str) -> Path:
+    """Where a run is: as it is said, or the bundled agent of this name.
+
+    Args:
+      run: a folder, a point of its history, or the name of a bundled agent, "18-4-best" or
+        "agents/18-4-best". What exists comes first.
+    """
+    path = Path(run)
+    name = path.name if path.parent in (Path(), Path("agents")) else ""
+    if not path.exists() and name in names():
+        return folder() / name
+    return path
+
+
+def is_bundled(run: Path) -> bool:
+    """Whether a run is a bundled agent; nothing should be written into its folder."""
+    return run.resolve().parent == folder().resolve()
