@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import tyro
 
+from experiments import __main__ as tdanet
 from tests.support.pages import PAGES, ROOT, blocks
 
 #: Other programs that the pages may name.
@@ -84,6 +85,15 @@ def test_a_command_is_accepted(
         monkeypatch.chdir(tmp_path)
         with pytest.raises(Parsed):
             importlib.import_module(module).main()
+    elif program == "tdanet":
+        for place, name in PARSERS:
+            monkeypatch.setattr(place, name, raising(getattr(place, name)))
+        monkeypatch.chdir(tmp_path)
+        if ">" in rest:
+            rest = rest[: rest.index(">")]
+        with pytest.raises((Parsed, SystemExit)) as ended:
+            tdanet.main(rest)
+        assert ended.type is Parsed or not ended.value.code
     elif program == "pip":
         assert rest[0] == "install"
         project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

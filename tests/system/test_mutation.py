@@ -24,7 +24,7 @@ class Fault(NamedTuple):
     module: str  # path below tdanet_jax/
     right: str
     wrong: str
-    tests: str  # paths below tests/
+    tests: str  # paths below tests/; a test that is named may be a slow one
 
 
 ENV, LEARNER, TDANET = "env/dynamics.py", "training/learner.py", "models/tdanet.py"
@@ -350,9 +350,10 @@ FAULTS = (
           "class_table.row[obs.classes]", "models/test_ssnet.py"),
     Fault("no gradient from what nodes share", "models/shared/graph_convolutions.py",
           'degree=jnp.einsum("nbh,bh->n", first, shared)', "degree=0 * weights.degree",
-          "models/test_mjolnir.py"),
+          "models/test_mjolnir.py::test_the_gradient_is_that_of_the_published_equations"),
     Fault("inner steps uphill", "models/shared/adaptation.py", "-model.rate * product_grad",
-          "model.rate * product_grad", "models/shared/test_adaptation.py"),
+          "model.rate * product_grad",
+          "models/shared/test_adaptation.py::test_values_and_gradients_are_those_of_plain_per_environment_parameters"),
     Fault("largest of corrected moments", LEARNER, "bias_correction_nu=False",
           "bias_correction_nu=True", "training/test_learner.py"),
     Fault("every kernel is rounded", LEARNER, "x.ndim > 1 and x.size > SMALL", "x.ndim > 1",
@@ -372,7 +373,7 @@ FAULTS = (
           "a, b = a.reshape(-1, a.shape[-1]), b.reshape(-1, b.shape[-1])\n"
           "    if a.ndim <= 2 or jax.default_backend()", "training/test_devices.py"),
     Fault("all seeds become the first", "training/run.py", "lambda x, i=i: x[i]", "lambda x, i=i: x[0]",
-          "training/test_run.py"),
+          "training/test_run.py::test_seeds_trained_together_go_the_way_of_each_alone"),
     Fault("an old name is not known any more", "training/renames.py", 'r"^held$"', 'r"^helm$"',
           "training/test_old_runs.py"),
     Fault("an agent that was passed on is trained over", "training/checkpoint.py",
@@ -475,6 +476,7 @@ FAULTS = (
 def passes(root: Path, tests: str) -> bool:
     """Whether the tests pass in a copy of the repository."""
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider"]
+    command += ["-m", ""] if "::" in tests else []
     environment = {**os.environ, "PYTHONPATH": str(root)}
     done = subprocess.run(
         [*command, *(f"tests/{name}" for name in tests.split())],

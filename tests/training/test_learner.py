@@ -398,7 +398,6 @@ def test_an_update_is_one_step_of_clipped_adam_on_the_gradient_of_the_loss(
         chex.assert_trees_all_close(state.params, expected, rtol=1e-4, atol=2e-5)
 
 
-@pytest.mark.slow
 def test_only_large_kernels_are_rounded_while_acting() -> None:
     model = ActorCritic(TDANetEncoder(width=12, dtype=jnp.bfloat16), hidden=8, dtype=jnp.bfloat16)
     state = start(1)
