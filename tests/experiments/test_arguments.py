@@ -111,7 +111,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--out full/file/below", "full/file/below: Not a directory"),
     ],
     "share": [
-        ("", "Missing from share: --checkpoint PATH"),
+        ("", "Missing from share: --checkpoint RUN"),
         ("--checkpoint bare --out full", "--out full: exists and is not empty"),
         ("--checkpoint bare --out new", "bare: no checkpoint"),
         ("--checkpoint bare --out full/file/below", "--out full/file/below: Not a directory"),

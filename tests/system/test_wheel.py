@@ -71,6 +71,6 @@ def test_it_finds_what_it_reads_from_any_folder(unpacked, tmp_path):
     found = [Path(line) for line in done.stdout.splitlines()]
     assert {path.name for path in found} == {
         "ithor.npz", "labels.json", "open.json", "words.npz", "episodes.npz", "NOTICE",
-        "replay.html",
+        "furniture.json.gz", "replay.html",
     }  # fmt: skip
     assert all(path.is_file() and path.is_relative_to(unpacked) for path in found)

@@ -108,7 +108,7 @@ def _fixed(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def build_asset(procthor_wheel: Path, out_dir: Path, rooms: list[Scene]) -> Path:
+def build_asset(procthor_wheel: Path | str, out_dir: Path | str, rooms: list[Scene]) -> Path:
     """Writes the catalogue into `out_dir`; equal wheels give equal bytes.
 
     Args:
@@ -142,7 +142,7 @@ def build_asset(procthor_wheel: Path, out_dir: Path, rooms: list[Scene]) -> Path
         "spots": {name: found for name, found in spots.items() if found},
         "groups": [_members(group["assetMetadata"], group["treeData"]) for group in groups],
     }
-    path = out_dir / ASSET
+    path = Path(out_dir) / ASSET
     text = json.dumps(content, separators=(",", ":"), sort_keys=True)
     path.write_bytes(gzip.compress(text.encode(), mtime=0))
     return path
