@@ -121,7 +121,7 @@ def _build(
 def _seen(scene: Scene, targets: Sequence[str]) -> tuple[Scene, SceneTables]:
     """A room without the small objects that can be seen from nowhere within reach, and its tables.
 
-    What hides behind something is gone once that is: so it is until none is left.
+    Without an object, others may be seen differently, so this is repeated until none is hidden.
     """
     while True:
         tables = tabulation.build_room(scene, targets)

@@ -62,7 +62,7 @@ class Catalogue:
       models: class -> (width, height, depth) in metres [n, 3], the front along the depth.
       rooms: class -> for each model, the iTHOR training rooms that contain it.
       spots: class -> where it stands: any of corner, edge and middle.
-      groups: arrangements of several objects, the first one being the root.
+      groups: arrangements of several objects; the first object is the root.
     """
 
     models: Mapping[str, np.ndarray]
@@ -153,8 +153,8 @@ def _members(
 ) -> list[dict[str, Any]]:
     """The members of a group, parents first.
 
-    In ProcTHOR's files, positions along x count to the left; anchors are the cells of a 3 x 3 grid
-    over the parent, from the right and from behind.
+    In ProcTHOR's files, x points to the left; anchors are the cells of a 3 x 3 grid over the
+    parent, counted from its right and from its back.
     """
     found: list[dict[str, Any]] = []
     for tree in trees:
