@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.animation import PillowWriter
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MultipleLocator
+from PIL import Image
 
 from tdanet_jax.analysis import drawing
 from tdanet_jax.analysis.drawing import BLUE, DASHED, FRAME, GREEN, ORANGE, SHADES
@@ -77,12 +78,19 @@ def animation(traces: Sequence[Trace], plan: FloorPlan, tables: SceneTables, pat
     handles = [_FIELD_OF_VIEW, *_view_handles(traces[0])]
     widths = [high * (x2 - x1) / (z2 - z1), high]
     figure, panels = _panels(2 * len(traces), widths, high, title, handles)
-    last, writer = max(len(trace.actions) for trace in traces), PillowWriter(fps=2)
-    with files.replacing(path) as fresh, writer.saving(figure, fresh, drawing.DPI):
-        for step in [*range(last + 1), *[last] * 5]:  # the end stays for three seconds
-            for left, right, trace in zip(panels[::2], panels[1::2], traces, strict=True):
-                _draw_step(left, right, trace, min(step, len(trace.actions)), plan, tables)
-            writer.grab_frame()
+    figure.set_dpi(drawing.DPI)
+    last, canvas = max(len(trace.actions) for trace in traces), FigureCanvasAgg(figure)
+    frames = []
+    for step in range(last + 1):
+        for left, right, trace in zip(panels[::2], panels[1::2], traces, strict=True):
+            _draw_step(left, right, trace, min(step, len(trace.actions)), plan, tables)
+        canvas.draw()
+        frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
+    milliseconds = [*[500] * last, 3000]
+    with files.replacing(path) as fresh:
+        frames[0].save(
+            fresh, "GIF", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0
+        )
 
 
 def _draw_step(

@@ -24,7 +24,7 @@ from tdanet_jax.vocabulary import ROOM_TYPES
 from tdanet_jax.workflows.evaluate import short_names
 from tests.conftest import save_untrained
 from tests.evaluation.test_comparison import result as made_up
-from tests.support import command, samples
+from tests.support import samples
 from tests.support.pages import block
 from tests.system.test_faults import full_disk
 
@@ -32,8 +32,7 @@ from tests.system.test_faults import full_disk
 def test_the_shortest_path_policy_scores_100(ithor, tmp_path):
     """Through the whole command: every test episode can be solved, in exactly L actions."""
     out = tmp_path / "oracle"
-    done = command.run("evaluate", "--policy", "shortest_path", "--split", "14/8", "--out", out)
-    assert done.returncode == 0, done.stderr
+    evaluate.main(["--policy", "shortest_path", "--split", "14/8", "--out", str(out)])
     results = json.loads((out / "results.json").read_text())
     assert [results[name] for name in ("seed", "evaluation_seed", "data")] == [0, 0, None]
     for group in ("seen", "unseen"):

@@ -55,6 +55,7 @@ print("equal")
 """
 
 
+@pytest.mark.slow
 def test_an_update_on_eight_devices_is_the_update_on_one():
     done = subprocess.run([sys.executable, "-c", EIGHT], capture_output=True, text=True)
     assert done.stdout == "equal\n", done.stderr

@@ -63,6 +63,7 @@ def test_all_its_arrays_are_known_by_the_names_of_today(run: Path, task: Task) -
             np.testing.assert_array_equal(known[name], leaf, err_msg=name)
 
 
+@pytest.mark.slow
 def test_it_resumes_and_is_saved_with_the_names_of_today(run: Path, task: Task) -> None:
     again = Run(run, configs.load(run / CONFIG_FILE), task)
     updates = int(again.state.updates)
