@@ -371,7 +371,8 @@ FAULTS = (
     Fault("devices exchange their rollouts", "models/matmul.py",
           "if a.ndim <= 2 or jax.default_backend()",
           "a, b = a.reshape(-1, a.shape[-1]), b.reshape(-1, b.shape[-1])\n"
-          "    if a.ndim <= 2 or jax.default_backend()", "training/test_devices.py"),
+          "    if a.ndim <= 2 or jax.default_backend()",
+          "training/test_devices.py::test_an_update_on_eight_devices_is_the_update_on_one"),
     Fault("all seeds become the first", "training/run.py", "lambda x, i=i: x[i]", "lambda x, i=i: x[0]",
           "training/test_run.py::test_seeds_trained_together_go_the_way_of_each_alone"),
     Fault("an old name is not known any more", "training/renames.py", 'r"^held$"', 'r"^helm$"',
