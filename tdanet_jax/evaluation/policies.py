@@ -23,10 +23,15 @@ class Policy(NamedTuple):
 
     `start(weights, batch)` gives the policy's memory at the start of the episodes, and
     `act(weights, memory, key, state, params)` the memory and the actions [B] of the next step.
+
+    If `in_parts`, `act` can be asked for some of the episodes: given `rows` [b] as well, their
+    places in the batch, `state` and the actions are those of these rows, and the memory is that of
+    all. Rows from B on are padding. What a row does must not depend on which others are asked for.
     """
 
     start: Callable[[Any, int], Any]
-    act: Callable[[Any, Any, jax.Array, EnvState, EnvParams], tuple[Any, jax.Array]]
+    act: Callable[..., tuple[Any, jax.Array]]
+    in_parts: bool = False
 
 
 def random() -> Policy:
@@ -72,17 +77,34 @@ def network(
         return class_table, actor_critic.initial_state(model, weights, batch)
 
     def act(
-        weights: Any, memory: Any, key: jax.Array, state: EnvState, params: EnvParams
+        weights: Any,
+        memory: Any,
+        key: jax.Array,
+        state: EnvState,
+        params: EnvParams,
+        rows: jax.Array | None = None,
     ) -> tuple[Any, jax.Array]:
         class_table, recurrent = memory
-        obs = observe(state, params)
-        recurrent, out, _ = actor_critic.act(model, weights, class_table, recurrent, obs)
+        own, batch = take(recurrent, rows), len(recurrent.is_first)
+        own, out, _ = actor_critic.act(model, weights, class_table, own, observe(state, params))
         logits = out.logits.at[:, never].set(-jnp.inf) if len(never) else out.logits
-        sampled = jax.random.categorical(key, logits)
-        action = jnp.argmax(logits, axis=-1) if greedy else sampled
-        return (class_table, recurrent), action
+        if not greedy:  # the categorical distribution's own sampling, by the Gumbel trick
+            logits += take(jax.random.gumbel(key, (batch, NUM_ACTIONS)), rows)
+        return (class_table, put(recurrent, rows, own)), jnp.argmax(logits, axis=-1)
 
-    return Policy(start, act)
+    return Policy(start, act, in_parts=True)
+
+
+def take(tree: Any, rows: jax.Array | None) -> Any:
+    """These rows [b] of every leaf [B, ...]; all of them if `rows` is None."""
+    return tree if rows is None else jax.tree.map(lambda x: x[rows], tree)
+
+
+def put(tree: Any, rows: jax.Array | None, new: Any) -> Any:
+    """The tree with new values in these rows; rows from B on are left out."""
+    if rows is None:
+        return new
+    return jax.tree.map(lambda x, y: x.at[rows].set(y, mode="drop"), tree, new)
 
 
 def on_vectors(

@@ -14,8 +14,10 @@ import numpy as np
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.evaluation.episodes import Episodes
-from tdanet_jax.evaluation.policies import Policy
+from tdanet_jax.evaluation.policies import Policy, put, take
 from tdanet_jax.vocabulary import Action
+
+PART = 128  # episodes that a CPU plays at once
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +125,7 @@ def _play(
     target: jax.Array,
     key: jax.Array,
 ) -> tuple[jax.Array, ...]:
-    count = pose.shape[0]
+    count, part = pose.shape[0], _part(policy, pose.shape[0])
     transition = jax.vmap(dynamics.transition, (0, 0, None))
     own = None
     if params.noise is not None:  # no step folds this number into the key
@@ -131,12 +133,15 @@ def _play(
     state = jax.vmap(dynamics.start, (0, 0, None, None, 0))(pose, target, params, None, own)
 
     def unfinished(loop: tuple) -> jax.Array:
-        step, _, _, alive, *_ = loop
+        step, _, (_, alive, *_) = loop
         return (step < limit) & jnp.any(alive)
 
-    def body(loop: tuple) -> tuple:
-        step, state, memory, alive, success, actions, collided = loop
-        memory, action = policy.act(weights, memory, jax.random.fold_in(key, step), state, params)
+    def step_of(step: jax.Array, memory: Any, played: tuple, rows: jax.Array | None) -> tuple:
+        """The next step of some episodes, or of all."""
+        state, alive, success, actions, collided = take(played, rows)
+        some = {} if rows is None else {"rows": rows}
+        own = jax.random.fold_in(key, step)
+        memory, action = policy.act(weights, memory, own, state, params, **some)
         out = transition(state, action, params)
         blocked = (action == Action.MOVE_AHEAD) & (out.state.pose == state.pose)
         collided = collided | (alive & blocked)
@@ -144,16 +149,40 @@ def _play(
         actions = actions.at[:, step].set(jnp.where(alive, action, -1).astype(jnp.int8))
         success = success | (alive & out.success)
         alive = alive & ~out.terminated & ~out.truncated
-        return step + 1, state, memory, alive, success, actions, collided
+        return memory, put(played, rows, (state, alive, success, actions, collided))
 
-    loop = (
-        jnp.zeros((), jnp.int32),
+    def body(loop: tuple) -> tuple:
+        step, memory, played = loop
+        if part == count:
+            return step + 1, *step_of(step, memory, played, None)
+        _, alive, *_ = played
+        order = jnp.argsort(~alive, stable=True)  # those that go on are first
+        padded = jnp.pad(order, (0, -count % part), constant_values=count)
+
+        def some(i: jax.Array, carried: tuple) -> tuple:
+            rows = jax.lax.dynamic_slice(padded, (i * part,), (part,))
+            memory, played = carried
+            return step_of(step, memory, played, rows)
+
+        parts = -(-alive.sum() // part)
+        return step + 1, *jax.lax.fori_loop(0, parts, some, (memory, played))
+
+    played = (
         state,
-        policy.start(weights, count),
         jnp.ones(count, bool),
         jnp.zeros(count, bool),
         jnp.full((count, limit), -1, jnp.int8),
         jnp.zeros(count, bool),
     )
-    _, state, _, _, success, actions, collided = jax.lax.while_loop(unfinished, body, loop)
+    loop = jnp.zeros((), jnp.int32), policy.start(weights, count), played
+    _, _, (state, _, success, actions, collided) = jax.lax.while_loop(unfinished, body, loop)
     return state.shortest, state.steps, success, actions, collided
+
+
+def _part(policy: Policy, count: int) -> int:
+    """How many episodes play at once: those that have ended cost nothing if others do not wait.
+
+    An accelerator would rather play all of them, ended or not.
+    """
+    few = policy.in_parts and jax.default_backend() == "cpu"
+    return min(PART, count) if few else count

@@ -1,6 +1,6 @@
 """Evaluation with senses that err: agents at five levels of each kind of noise, and the report.
 
-A sweep takes about an hour for each agent. `noise.json` is written after every level, and a sweep
+A sweep takes some ten minutes for each agent. `noise.json` is written after every level, and one
 that was stopped continues with those that it does not hold.
 """
 

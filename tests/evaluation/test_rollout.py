@@ -249,6 +249,20 @@ def test_sampled_actions_follow_the_probabilities_of_the_network(
     chex.assert_shape(records.actions, (4000, 1))
 
 
+def test_episodes_play_in_parts_as_they_do_at_once(
+    rooms: SceneTables, params: EnvParams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights, words = network_weights(len(rooms.classes))
+    chosen = drawn(rooms, 5)
+    alone = rollout.evaluate(network_policy(len(rooms.classes)), weights, params, chosen, KEY)
+    assert len(chosen) % 7  # the last part is not full
+    assert len({*alone.length.tolist()}) > 7  # and parts become fewer
+    monkeypatch.setattr(rollout, "PART", 7)
+    policy = policies.network(MODEL, words)  # not yet compiled
+    parts = rollout.evaluate(policy, weights, params, chosen, KEY)
+    jax.tree.map(np.testing.assert_array_equal, vars(parts), vars(alone))
+
+
 @pytest.mark.parametrize("greedy", [True, False])
 def test_forbidden_actions_are_never_taken(
     rooms: SceneTables, params: EnvParams, greedy: bool
