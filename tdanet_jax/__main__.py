@@ -1,4 +1,4 @@
-"""All commands under one name: `tdanet NAME`, or `python -m experiments NAME`."""
+"""All commands under one name: `tdanet NAME`, or `python -m tdanet_jax NAME`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import difflib
 import importlib
 import sys
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Annotated, Any, Union
 
-import experiments
+from tdanet_jax import commands
 
 #: Name -> module, and what it does.
 COMMANDS = {
@@ -36,9 +37,9 @@ Zero-shot object-goal navigation in the iTHOR rooms.
   --version, --completion bash|zsh"""
 
 
-def main(arguments: Sequence[str]) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Runs the command that is named first."""
-    name, *rest = arguments or ["--help"]
+    name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
         say(HELP)
     elif name == "--version":
@@ -48,22 +49,23 @@ def main(arguments: Sequence[str]) -> None:
     elif name == "--completion":
         complete(rest)
     elif name not in COMMANDS:
-        from experiments.console import fail
+        from tdanet_jax.commands.console import fail
 
         near = difflib.get_close_matches(name, COMMANDS, 1)
         hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(COMMANDS)}"
         fail(f"{name}: no such command; {hint}")
     else:
-        experiments.subcommand = name
-        try:
-            importlib.import_module(f"experiments.{COMMANDS[name][0]}").main(rest)
-        finally:
-            experiments.subcommand = None
+        load(name).main(rest)
+
+
+def load(name: str) -> ModuleType:
+    """The module of a command."""
+    return importlib.import_module(f"tdanet_jax.commands.{COMMANDS[name][0]}")
 
 
 def say(text: str) -> None:
     """Prints a text."""
-    from experiments.console import console
+    from tdanet_jax.commands.console import console
 
     console.print(text)
 
@@ -72,29 +74,31 @@ def complete(arguments: Sequence[str]) -> None:
     """Prints the script with which a shell completes the commands and their flags."""
     import tyro
 
-    from experiments.console import fail, one_line_usage
+    from tdanet_jax.commands.console import fail, one_line_usage
 
     if len(arguments) != 1 or arguments[0] not in ("bash", "zsh"):
         fail("--completion: choose bash or zsh")
-    commands: dict[str, Any] = {}
-    for name, (module, _) in COMMANDS.items():
-        found = importlib.import_module(f"experiments.{module}")
+    parsed: dict[str, Any] = {}
+    for name in COMMANDS:
+        found = load(name)
         if hasattr(found, "Command"):
-            commands[name] = found.Command
+            parsed[name] = found.Command
         else:  # it has commands of its own
             kinds = (Annotated[c, tyro.conf.subcommand(n)] for n, c in found.COMMANDS.items())
-            commands[name] = Union[tuple(kinds)]  # noqa: UP007
+            parsed[name] = Union[tuple(kinds)]  # noqa: UP007
     with one_line_usage():
         tyro.extras.subcommand_cli_from_dict(
-            commands, prog="tdanet", args=["--tyro-print-completion", arguments[0]]
+            parsed, prog="tdanet", args=["--tyro-print-completion", arguments[0]]
         )
 
 
 def script() -> None:
     """The entry point `tdanet`."""
-    experiments.begin()
-    main(sys.argv[1:])
+    commands.begin()
+    if not sys.flags.safe_path:
+        sys.path.append("")  # custom models and sensors of the working folder: they hide nothing
+    main()
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    script()

@@ -1,4 +1,4 @@
-"""One file per command: `python -m experiments.NAME`; `tdanet NAME` where it is installed."""
+"""The commands: one file for each, and what they share. `tdanet` lists them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import os
 import signal
 import sys
 
-#: The command's name if it was started as `tdanet NAME`.
-subcommand: str | None = None
 #: Exit status of a command that was stopped by a signal and has cleaned up.
 exit_status: int | None = None
 
@@ -36,7 +34,3 @@ def begin() -> None:
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     atexit.register(_leave)
-
-
-if sys.argv[0] == "-m":
-    begin()

@@ -1,7 +1,7 @@
 """Shows what a trained agent attends to.
 
-    python -m experiments.attention --checkpoint runs/...
-    python -m experiments.attention --checkpoint runs/... --scene FloorPlan228 --target Laptop
+    tdanet attention --checkpoint runs/...
+    tdanet attention --checkpoint runs/... --scene FloorPlan228 --target Laptop
 
 The first form plays the fixed test episodes, and writes to --out the mean attention by class pair
 (class_pairs.csv, .md, .png) and a picture of one episode. The second draws the chosen episode.
@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from experiments import one_episode
-from experiments.console import (
+from tdanet_jax.commands import one_episode
+from tdanet_jax.commands.console import (
     RunPath,
     check_folder,
     console,
@@ -26,7 +26,8 @@ from experiments.console import (
     one_line_errors,
     parse,
 )
-from experiments.one_episode import Choice
+from tdanet_jax.commands.one_episode import Choice
+from tdanet_jax.io.bundled_agents import folder_of
 
 if TYPE_CHECKING:
     from tdanet_jax.analysis.trace import Player, Trace
@@ -52,7 +53,7 @@ class Command:
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
-        command = parse(Command, arguments, prog="attention", description=__doc__)
+        command = parse(Command, arguments, prog="tdanet attention", description=__doc__)
         one_episode.check(command.choice, [command.checkpoint], required=False)
         check_folder(command.out or default_folder(command))
         show(command)
@@ -67,7 +68,7 @@ def show(command: Command) -> None:
     devices.start()
     choice, runs = command.choice, [command.checkpoint]
     out = command.out or default_folder(command)
-    player = one_episode.load_players(choice, runs, one_episode.load_rooms(choice, runs))[0]
+    player = one_episode.load_players(choice, runs, one_episode.rooms_of(choice, runs))[0]
     tables = player.task.tables
     if not player.attends:
         fail(
@@ -89,9 +90,9 @@ def show(command: Command) -> None:
 
 def default_folder(command: Command) -> Path:
     """The default of --out: one folder for each network and policy."""
-    point = f"-{command.checkpoint.stem}" if command.checkpoint.suffix == ".npz" else ""
-    folder = folder_for(one_episode.folder_of(command.checkpoint))
-    return folder / f"attention-{command.choice.policy}{point}"
+    run = folder_of(command.checkpoint)
+    point = "" if run == command.checkpoint else f"-{command.checkpoint.stem}"
+    return folder_for(run) / f"attention-{command.choice.policy}{point}"
 
 
 def play_lists(player: Player, tables: SceneTables, seed: int) -> Played:
@@ -145,7 +146,3 @@ def example(player: Player, tables: SceneTables, played: Played) -> Trace:
                 actions = records.actions[found[0], : records.length[found[0]]]
                 return trace.retrace(player, tables, episode, actions)
     raise ValueError("no test episodes")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Measures speed on this machine, with compilation and run time apart.
 
-    python -m experiments.benchmark --out benchmark.jsonl
+    tdanet benchmark --out benchmark.jsonl
 
 Every value is the median over repetitions. Shares of the peak count 6 floating-point operations
 (forward and backward) for each multiply-accumulate of a forward step, by a formula; work that is
@@ -26,7 +26,14 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 from rich.table import Table
 
-from experiments.console import RunPath, check_positive, console, fail, one_line_errors, parse
+from tdanet_jax.commands.console import (
+    RunPath,
+    check_positive,
+    console,
+    fail,
+    one_line_errors,
+    parse,
+)
 from tdanet_jax.config import NetworkConfig, TrainConfig
 
 if TYPE_CHECKING:
@@ -65,7 +72,7 @@ class Command:
     triangulation: bool = False
     """With --odometry, also give them triangulation."""
     data: str | None = None
-    """File of rooms that `experiments.scenes import` wrote, instead of the bundled ones."""
+    """File of rooms that `tdanet scenes import` wrote, instead of the bundled ones."""
     devices: int = 1
     """Devices that the environments of the `environment` part are split over; a CPU is split into
     as many."""
@@ -85,7 +92,7 @@ class Command:
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
-        command = parse(Command, arguments, prog="benchmark")
+        command = parse(Command, arguments, prog="tdanet benchmark")
         if command.out is not None and command.out.exists():
             fail(f"--out {command.out}: exists")
         check_positive(
@@ -230,7 +237,7 @@ def import_row(task: Task) -> Row:
         began = time.perf_counter()
         exporter.write_folder(task.tables, folder, lambda share, name: None)
         written = time.perf_counter()
-        command = [sys.executable, "-m", "experiments.scenes", "import", "--from", str(folder)]
+        command = [sys.executable, "-m", "tdanet_jax", "scenes", "import", "--from", str(folder)]
         done = subprocess.run([*command, "--out", str(out)], capture_output=True, text=True)
         if done.returncode:
             raise ValueError(f"import: {done.stderr.strip()}")
@@ -254,7 +261,7 @@ def startup_row() -> Row:
     """
     from tdanet_jax.scenes import cache
 
-    train = [sys.executable, "-m", "experiments.train_zero_shot"]
+    train = [sys.executable, "-m", "tdanet_jax", "train"]
     row: Row = {"part": "startup"}
     with tempfile.TemporaryDirectory() as place:
         home = Path(place)
@@ -291,7 +298,3 @@ def as_table(rows: list[Row]) -> Table:
         results = ", ".join(f"{k} {v}" for k, v in row.items() if k not in (*settings, "part"))
         table.add_row(row["part"], setting, results)
     return table
-
-
-if __name__ == "__main__":
-    main()

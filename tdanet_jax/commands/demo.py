@@ -1,7 +1,7 @@
 """Shows the bundled agent finding something: writes a page and opens it.
 
-    python -m experiments.demo
-    python -m experiments.demo --scene FloorPlan305 --target pillow
+    tdanet demo
+    tdanet demo --scene FloorPlan305 --target pillow
 
 The page shows, step by step, the path on the floor plan, what the agent sees and attends to, and
 its action probabilities. If --out ends in .gif, it becomes an animation.
@@ -13,9 +13,9 @@ import dataclasses
 import webbrowser
 from pathlib import Path
 
-from experiments import one_episode
-from experiments.console import RunPath, check_file, console, fail, one_line_errors, parse
-from experiments.one_episode import Choice
+from tdanet_jax.commands import one_episode
+from tdanet_jax.commands.console import RunPath, check_file, console, fail, one_line_errors, parse
+from tdanet_jax.commands.one_episode import Choice
 from tdanet_jax.io.bundled_agents import find_run
 
 #: A task has rooms to train in and rooms to be tested in; these two are computed in no time.
@@ -44,7 +44,7 @@ class Command:
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
-        command = parse(Command, arguments, prog="demo", description=__doc__)
+        command = parse(Command, arguments, prog="tdanet demo", description=__doc__)
         command = dataclasses.replace(command, checkpoint=find_run(command.checkpoint))
         choice = Choice(scene=command.scene, target=command.target, seed=command.seed)
         one_episode.check(choice, [command.checkpoint])
@@ -81,7 +81,3 @@ def show(command: Command, choice: Choice) -> None:
     else:
         files.write_text(command.out, replay.page(traces, tables))
     one_episode.print_outcomes(traces, command.out)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,10 +1,10 @@
 """Evaluates trained agents or untrained policies on the fixed test episodes.
 
-    python -m experiments.evaluate --checkpoint runs/... --policy greedy
-    python -m experiments.evaluate --checkpoint runs/... --history
-    python -m experiments.evaluate --checkpoint runs/a --checkpoint runs/b --out compared
-    python -m experiments.evaluate --checkpoint runs/... --noise sweep
-    python -m experiments.evaluate --policy random --split 18/4 --out random
+    tdanet evaluate --checkpoint runs/... --policy greedy
+    tdanet evaluate --checkpoint runs/... --history
+    tdanet evaluate --checkpoint runs/a --checkpoint runs/b --out compared
+    tdanet evaluate --checkpoint runs/... --noise sweep
+    tdanet evaluate --policy random --split 18/4 --out random
 
 Writes results.json, results.md and episodes.jsonl for one agent; for several checkpoints or a
 history, evaluations.json, evaluations.md, episodes.jsonl and, of a history, learning_curve.png.
@@ -20,7 +20,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from experiments.console import (
+from tdanet_jax.commands.console import (
     RunPath,
     console,
     fail,
@@ -66,7 +66,7 @@ class Command:
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
-        command = parse(Command, arguments, prog="evaluate")
+        command = parse(Command, arguments, prog="tdanet evaluate")
         trained = command.policy in ("sample", "greedy")
         if trained and not command.checkpoint:
             fail(f"--policy {command.policy} needs --checkpoint")
@@ -147,7 +147,3 @@ def play(command: Command, config: TrainConfig, folder: Path) -> None:
     if not several:
         print_summary(results)
     console.print(f"wrote {folder / ('evaluations.md' if several else 'results.md')}")
-
-
-if __name__ == "__main__":
-    main()

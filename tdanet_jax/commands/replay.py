@@ -1,6 +1,6 @@
 """Writes an episode as one self-contained HTML page.
 
-    python -m experiments.replay --checkpoint runs/... --scene FloorPlan228 --target Laptop
+    tdanet replay --checkpoint runs/... --scene FloorPlan228 --target Laptop
 
 The page shows, step by step, the path on the floor plan, what the agent sees and attends to, its
 action probabilities and its value; several agents side by side.
@@ -11,8 +11,8 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from experiments import one_episode
-from experiments.console import check_file, one_line_errors, parse
+from tdanet_jax.commands import one_episode
+from tdanet_jax.commands.console import check_file, one_line_errors, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Command(one_episode.Comparison):
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
-        command = parse(Command, arguments, prog="replay", description=__doc__)
+        command = parse(Command, arguments, prog="tdanet replay", description=__doc__)
         one_episode.check(command.choice, command.checkpoint)
         check_file(command.out)
         from tdanet_jax.analysis import replay
@@ -37,7 +37,3 @@ def main(arguments: list[str] | None = None) -> None:
         command.out.parent.mkdir(parents=True, exist_ok=True)
         files.write_text(command.out, page)
         one_episode.print_outcomes(traces, command.out)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Measures how the cost of training grows with environments, rooms, classes and detections.
 
-    python -m experiments.scaling --out scaling
+    tdanet scaling --out scaling
 
 Changes one size at a time; the others keep their defaults. Additional rooms repeat the 80 training
 rooms; additional classes and detections are rows that never occur. Writes scaling.jsonl and
@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.console import (
+from tdanet_jax.commands.console import (
     check_positive,
     console,
     one_line_errors,
@@ -54,7 +54,7 @@ class Command:
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
-        command = parse(Command, arguments, prog="scaling")
+        command = parse(Command, arguments, prog="tdanet scaling")
         files.check_empty(command.out)
         check_positive(
             environments=command.environments,
@@ -150,7 +150,3 @@ def with_detections(params: EnvParams, rows: int) -> EnvParams:
         row_class=jnp.pad(params.row_class, (0, more)),
         row_box=jnp.pad(params.row_box, ((0, more), (0, 0))),
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Answers frames with actions: one JSON frame a line in, one JSON action a line out.
 
-    python -m experiments.serve --checkpoint agents/18-4-best --hfov 69 --vfov 55
+    tdanet serve --checkpoint agents/18-4-best --hfov 69 --vfov 55
 
 A line names what to look for, once, and lists what is detected:
 
@@ -22,9 +22,9 @@ from typing import BinaryIO
 
 import tyro
 
-from experiments.console import RunPath, one_line_errors, parse
 from tdanet_jax.agent.camera import Camera
 from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
+from tdanet_jax.commands.console import RunPath, one_line_errors, parse
 
 #: Bytes of a line.
 LONGEST = 1 << 20
@@ -66,7 +66,7 @@ class Command:
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
-        command = parse(Command, arguments, prog="serve", description=__doc__)
+        command = parse(Command, arguments, prog="tdanet serve", description=__doc__)
         command.navigator.check()
         camera = command.camera
         from tdanet_jax.agent import load
@@ -105,7 +105,3 @@ def read_lines(stream: BinaryIO) -> Iterator[bytes | None]:
         while line and not line.endswith(b"\n") and len(line) == LONGEST:
             line = stream.readline(LONGEST)
         yield line if whole else None
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Makes a small folder of a trained agent, to keep or to pass on.
 
-    python -m experiments.share --checkpoint runs/... --out agents/mine
+    tdanet share --checkpoint runs/... --out agents/mine
 
 A fiftieth of the run's size: its newest network with 16 bits per parameter, configuration, classes,
 results and records, and a copy of its word vectors unless they are the bundled ones. Enough to
@@ -13,8 +13,8 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from experiments.console import RunPath, console, one_line_errors, parse
 from tdanet_jax import config as configs
+from tdanet_jax.commands.console import RunPath, console, one_line_errors, parse
 from tdanet_jax.config import CONFIG_FILE, WORD_VECTORS_FILE
 from tdanet_jax.io import files
 
@@ -34,7 +34,7 @@ class Command:
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
-        command = parse(Command, arguments, prog="share", description=__doc__)
+        command = parse(Command, arguments, prog="tdanet share", description=__doc__)
         files.check_empty(command.out)
         from tdanet_jax.evaluation import saved_networks
         from tdanet_jax.training import devices
@@ -50,7 +50,3 @@ def main(arguments: list[str] | None = None) -> None:
                 f"without its rooms, {data}: to evaluate or replay it, others need this file and "
                 "give its place with --data; tdanet_jax.load needs no rooms"
             )
-
-
-if __name__ == "__main__":
-    main()

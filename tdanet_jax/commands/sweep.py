@@ -1,6 +1,6 @@
 """Trains several splits, models and seeds, and reports them in the form of the paper's tables.
 
-    python -m experiments.sweep --splits 18/4 14/8 --seeds 0 1 2 --minutes 10 --out runs/sweep
+    tdanet sweep --splits 18/4 14/8 --seeds 0 1 2 --minutes 10 --out runs/sweep
 
 Every other flag is one of the training command and applies to all runs. After an interruption, run
 the same command again: it skips the finished runs and continues the unfinished one. Writes a folder
@@ -22,7 +22,7 @@ from pathlib import Path
 
 import tyro
 
-from experiments.console import (
+from tdanet_jax.commands.console import (
     check_folder,
     check_positive,
     console,
@@ -31,9 +31,9 @@ from experiments.console import (
     one_line_usage,
     reporter,
 )
-from experiments.running import Command as TrainingCommand
-from experiments.running import how_to_continue, parse_command, stoppable
-from experiments.streams import output_may_break
+from tdanet_jax.commands.running import Command as TrainingCommand
+from tdanet_jax.commands.running import how_to_continue, parse_command, stoppable
+from tdanet_jax.commands.streams import output_may_break
 from tdanet_jax.config import CONFIG_FILE, OWN_TASK, TrainConfig, run_name
 from tdanet_jax.io import files
 from tdanet_jax.splits import file_name
@@ -59,7 +59,7 @@ OWN = {
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Trains several splits, models and seeds; every other flag is one of train_zero_shot."""
+    """Trains several splits, models and seeds; every other flag is one of `tdanet train`."""
 
     out: Path
     """Folder of the sweep: a folder for each run, and the report."""
@@ -67,7 +67,7 @@ class Command:
     """Splits to train on: 22/0, 18/4, 14/8, or comma-separated unseen classes
     (Mug,Vase,CD,Towel)."""
     models: tuple[str, ...] = ("tdanet",)
-    """Models to train, ablations included; see --model of train_zero_shot."""
+    """Models to train, ablations included; see --model of `tdanet train`."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of each."""
     vmap_seeds: bool = False
@@ -85,7 +85,11 @@ def main(arguments: list[str] | None = None) -> None:
     with one_line_errors():
         with one_line_usage():
             command, rest = tyro.cli(
-                Command, args=words, return_unknown_args=True, prog="sweep", description=__doc__
+                Command,
+                args=words,
+                return_unknown_args=True,
+                prog="tdanet sweep",
+                description=__doc__,
             )
         if command.report_only and rest:
             fail(f"--report-only trains nothing and takes no {rest[0]}")
@@ -240,7 +244,3 @@ def costs(runs: Sequence[FinishedRun]) -> dict[str, Cost]:
             measured[network] = Cost(config.model, rows[BATCHES[0]]["parameters"], milliseconds)
         out.setdefault(label, measured[network])
     return out
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Trains an agent on the iTHOR training rooms and reports SR and SPL in the test rooms.
 
-    python -m experiments.train_zero_shot --split 18/4
+    tdanet train --split 18/4
 
 Writes config.json, classes.json, metrics.jsonl, checkpoints, results.json, results.md,
 episodes.jsonl and learning_curve.png into --out (by default
@@ -16,9 +16,9 @@ import sys
 import time
 from pathlib import Path
 
-from experiments.console import check_positive, console, fail, one_line_errors
-from experiments.running import Command, how_to_continue, parse_command, stoppable, trust
-from experiments.streams import output_may_break
+from tdanet_jax.commands.console import check_positive, console, fail, one_line_errors
+from tdanet_jax.commands.running import Command, how_to_continue, parse_command, stoppable, trust
+from tdanet_jax.commands.streams import output_may_break
 from tdanet_jax.config import TrainConfig, run_name
 from tdanet_jax.io import files
 
@@ -82,7 +82,3 @@ def run(command: Command, config: TrainConfig, folder: Path) -> None:
         )
         if results is not None and (setting := trust(config)):
             console.print(f"custom code: to evaluate or load this run, export {setting}")
-
-
-if __name__ == "__main__":
-    main()

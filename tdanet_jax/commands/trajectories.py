@@ -1,6 +1,6 @@
 """Draws the paths of one or several agents through the same episode on the floor plan.
 
-    python -m experiments.trajectories --checkpoint runs/A --checkpoint runs/B \\
+    tdanet trajectories --checkpoint runs/A --checkpoint runs/B \\
         --scene FloorPlan228 --target Laptop --out trajectories.png
 
 If --out ends in .gif, it becomes an animation: the path grows step by step, next to what the agent
@@ -12,8 +12,8 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from experiments import one_episode
-from experiments.console import check_file, check_picture, one_line_errors, parse
+from tdanet_jax.commands import one_episode
+from tdanet_jax.commands.console import check_file, check_picture, one_line_errors, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Command(one_episode.Comparison):
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
-        command = parse(Command, arguments, prog="trajectories", description=__doc__)
+        command = parse(Command, arguments, prog="tdanet trajectories", description=__doc__)
         one_episode.check(command.choice, command.checkpoint)
         from tdanet_jax.analysis import pictures
         from tdanet_jax.scenes import floor_plan
@@ -40,7 +40,3 @@ def main(arguments: list[str] | None = None) -> None:
         draw = pictures.animation if animated else pictures.trajectories
         draw(traces, plan, tables, command.out)
         one_episode.print_outcomes(traces, command.out)
-
-
-if __name__ == "__main__":
-    main()

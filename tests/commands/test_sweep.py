@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from experiments import evaluate, sweep
+from tdanet_jax.commands import evaluate, sweep
 from tdanet_jax.io import files
 from tdanet_jax.workflows.sweep_report import Cost
 from tests.evaluation.test_comparison import result

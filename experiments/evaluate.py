@@ -1,0 +1,8 @@
+"""`tdanet evaluate`, from a clone."""
+
+from __future__ import annotations
+
+from tdanet_jax.commands.evaluate import main
+
+if __name__ == "__main__":
+    main()
