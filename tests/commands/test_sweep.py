@@ -32,7 +32,7 @@ RUN_FILES = {
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "Missing from sweep: --out"),
+        ([], "Missing from tdanet sweep: --out"),
         (["--out=x", "--split", "14/8"], "--split: a sweep takes --splits"),
         (["--out=x", "--splits", "17/5"], "--split 17/5: choose one of"),
         (["--out=x", "--models", "cnn"], "--model cnn: choose one of"),
