@@ -37,8 +37,6 @@ FAULTS = (
           "pass", "commands/test_main.py"),
     Fault("nobody learns how to trust a run", "commands/running.py", "{trust(config)} tdanet train",
           "tdanet train", "commands/test_own_model.py"),
-    Fault("files are overwritten", "commands/console.py", 'fail(f"--out {path}: exists")', "pass",
-          "commands/test_arguments.py"),
     Fault("boxes of a narrow camera as they are", "agent/camera.py",
           "_rays(box, self.hfov, self.vfov or self.hfov)", "_rays(box, 90, 90)", "agent/test_camera.py"),
     Fault("what is kept does not turn", "agent/navigator.py", "turned(found, right,",
