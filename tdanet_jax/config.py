@@ -165,7 +165,7 @@ class TrainConfig:
     seed: int = 0
     """Random seed of parameters, episodes, actions and dropout."""
     data: str | None = None
-    """File of rooms that `experiments.scenes import` wrote, instead of the bundled ones."""
+    """File of rooms that `tdanet scenes import` wrote, instead of the bundled ones."""
     word_vectors: str | None = None
     """File of word vectors instead of the bundled GloVe 6B 50d: glove.6B.*.txt, the thor_glove
     HDF5 file, or an npz file with `words` and `vectors`. The network takes their dimension."""
@@ -188,7 +188,7 @@ class TrainConfig:
     """Minutes between checkpoints."""
     history: int = 20
     """Evenly spaced points of the budget at which parameters are kept, for the learning curve of
-    `experiments.evaluate --history`; 0 keeps none. A point of TDANet takes 12 MB."""
+    `tdanet evaluate --history`; 0 keeps none. A point of TDANet takes 12 MB."""
     max_skipped: int = 20
     """Stop after this many skipped updates since the start or --resume. An update is skipped if its
     loss or gradient is not finite."""
@@ -279,7 +279,7 @@ class EvalConfig:
     """Where an evaluation departs from the run's own task."""
 
     data: str | None = None
-    """File of rooms that `experiments.scenes import` wrote, instead of the run's or the bundled
+    """File of rooms that `tdanet scenes import` wrote, instead of the run's or the bundled
     ones; also the new place of a file that was moved."""
     word_vectors: str | None = None
     """File of word vectors, instead of the run's or the bundled ones. A run keeps a copy of the

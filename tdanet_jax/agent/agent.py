@@ -21,7 +21,7 @@ from tdanet_jax import words
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors
 from tdanet_jax.env.types import Observation
-from tdanet_jax.io.bundled_agents import find_run
+from tdanet_jax.io.bundled_agents import find_run, folder_of
 from tdanet_jax.labels import LabelError, Labels, Synonyms
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
@@ -397,12 +397,6 @@ def load(
     expected, width = agent.model.parameter_shapes(*shape), None if path is None else shape[1]
     history.check_fit(run, weights, expected, width)
     return agent
-
-
-def folder_of(run: Path | str) -> Path:
-    """The folder of a run, or of the run of a point of history (`history/<updates>.npz`)."""
-    path = Path(run)
-    return path.parent.parent if path.suffix == history.SUFFIX else path
 
 
 def read(run: Path | str) -> tuple[TrainConfig, Any, ClassVocabulary]:

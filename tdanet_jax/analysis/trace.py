@@ -25,7 +25,7 @@ from tdanet_jax.evaluation import policies, rollout
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.policies import Policy
 from tdanet_jax.evaluation.rollout import Records
-from tdanet_jax.io.bundled_agents import find_run
+from tdanet_jax.io.bundled_agents import find_run, folder_of
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.scenes import camera_view
@@ -95,7 +95,7 @@ def load_player(
     """
     run = find_run(run)
     config, weights, classes = agent.read(run)
-    path = find_word_vectors(config, agent.folder_of(run), word_vectors)
+    path = find_word_vectors(config, folder_of(run), word_vectors)
     task = task_in(rooms, dataclasses.replace(config.in_rooms_alone(), word_vectors=path))
     task.check_known(run, classes.names)
     expected = task.model.parameter_shapes(*task.words.shape)

@@ -192,7 +192,7 @@ def _committed(tables: SceneTables, split: Split) -> dict[str, Episodes]:
         if (split.is_open or tables.targets == ALL_TARGETS) and version != tables.data_version:
             raise ValueError(
                 f"{ASSET} belongs to scene tables {version}, these are {tables.data_version}: "
-                "reinstall tdanet_jax, or run `python -m experiments.scenes build`"
+                "reinstall tdanet_jax, or run `tdanet scenes build`"
             )
         if not split.is_open and not any(
             _same_targets(split, make_split(name, validation))

@@ -22,7 +22,7 @@ def folder() -> Path:
             return candidate
     raise AssetError(
         f"{package.parent / 'assets' / CHECKSUMS}: missing; "
-        "reinstall tdanet_jax or run `python -m experiments.scenes build`"
+        "reinstall tdanet_jax or run `tdanet scenes build`"
     )
 
 

@@ -1,9 +1,11 @@
-"""The agents that come with the package, by name. Imports no JAX."""
+"""Where runs are, and the agents that come with the package, by name. Imports no JAX."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+#: How a point of a run's history ends: `history/<updates>.npz`.
+SUFFIX = ".npz"
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -30,6 +32,12 @@ def find_run(run: Path | str) -> Path:
     if not path.exists() and name in names():
         return folder() / name
     return path
+
+
+def folder_of(run: Path | str) -> Path:
+    """The folder of a run, or of the run of a point of history (`history/<updates>.npz`)."""
+    path = Path(run)
+    return path.parent.parent if path.suffix == SUFFIX else path
 
 
 def is_bundled(run: Path) -> bool:

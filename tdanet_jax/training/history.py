@@ -19,11 +19,11 @@ import numpy as np
 from flax import traverse_util
 
 from tdanet_jax.io import files
+from tdanet_jax.io.bundled_agents import SUFFIX
 from tdanet_jax.io.untrusted import FileError, jsons, npz, regular
 from tdanet_jax.training.renames import renamed
 
 FOLDER = "history"
-SUFFIX = ".npz"
 #: The network of a shared agent's folder (`saved_networks.share`).
 NETWORK = "network.npz"
 #: Parts of a parameter's name, at most: encoder/linear2/kernel has three.

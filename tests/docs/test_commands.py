@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import tyro
 
-from experiments import __main__ as tdanet
+from tdanet_jax import __main__ as tdanet
 from tests.support.pages import PAGES, ROOT, blocks
 
 #: Other programs that the pages may name.

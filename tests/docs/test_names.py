@@ -12,13 +12,10 @@ from typing import Any
 
 import pytest
 
+from tdanet_jax import __main__ as tdanet
+from tdanet_jax.commands import scenes
 from tests.support.pages import PAGES, ROOT, prose
 
-COMMANDS = (
-    "attention", "benchmark", "evaluate", "replay", "scaling", "scenes verify", "scenes inspect",
-    "scenes build", "scenes import", "scenes export", "scenes collect", "scenes vary",
-    "scenes compare", "serve", "share", "sweep", "train_zero_shot", "trajectories",
-)  # fmt: skip
 #: Flags of other programs that the pages mention.
 FOREIGN = {"--check", "--durations", "--fix", "--help", "--xla_gpu_deterministic_ops"}
 #: Where the files are that a page may name.
@@ -48,6 +45,16 @@ def test_modules_that_a_page_runs_exist(page: str) -> None:
 
 
 @pages
+def test_commands_that_a_page_mentions_exist(page: str) -> None:
+    for words in map(str.split, code(page)):
+        match words:
+            case ["tdanet", "scenes", name, *_]:
+                assert name in scenes.COMMANDS, words
+            case ["tdanet", name, *_] if not name.startswith("--"):
+                assert name in tdanet.COMMANDS, words
+
+
+@pages
 def test_names_of_the_package_that_a_page_mentions_exist(page: str) -> None:
     names = re.findall(r"`(tdanet_jax\.[\w.]+)", prose(page))
     reference = re.findall(r"^::: ([\w.]+)|#(tdanet_jax\.[\w.]+)\)", prose(page), re.MULTILINE)
@@ -65,11 +72,12 @@ def test_names_of_the_package_that_a_page_mentions_exist(page: str) -> None:
 def flags() -> set[str]:
     """The flags of all commands, as their help shows them."""
     known = set()
-    for command in COMMANDS:
-        name, *rest = command.split()
+    commands = [[name] for name in tdanet.COMMANDS if name != "scenes"]
+    commands += [["scenes", name] for name in scenes.COMMANDS]
+    for command in commands:
         said = io.StringIO()
         with contextlib.redirect_stdout(said), pytest.raises(SystemExit):
-            importlib.import_module(f"experiments.{name}").main([*rest, "--help"])
+            tdanet.main([*command, "--help"])
         known |= set(re.findall(r"--[a-z][\w-]*", said.getvalue()))
     return known
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import shlex
 import sys
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 
 import tdanet_jax
+from tdanet_jax import __main__ as tdanet
 from tdanet_jax import poses
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tests.support.command import TINY
@@ -32,9 +32,9 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def run(line: str, *more: str) -> None:
     """Runs a command of the page."""
-    python, _, module, *given = shlex.split(line)
-    assert python == "python"
-    importlib.import_module(module).main([*given, *more])
+    program, *given = shlex.split(line)
+    assert program == "tdanet"
+    tdanet.main([*given, *more])
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ import pytest
 
 import tdanet_jax
 from tdanet_jax.config import TrainConfig
+from tdanet_jax.io.bundled_agents import find_run
 from tests.support.pages import PAGES, ROOT, Block, blocks
 
 #: Pages whose blocks take long: by hand.
@@ -56,8 +57,7 @@ def test_the_blocks_of_a_page_run(
     page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One after the other, as a reader would type them; `runs/A` is the bundled agent."""
-    shutil.copytree(ROOT / "agents", tmp_path / "agents")
-    shutil.copytree(ROOT / "agents" / "18-4-best", tmp_path / "runs" / "A")
+    shutil.copytree(find_run("18-4-best"), tmp_path / "runs" / "A")
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {"__name__": "snippet"}
     for one in filter(runs, blocks(page)):

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import tdanet_jax
-from experiments import share
-from experiments.train_zero_shot import main as train
 from tdanet_jax import Agent, Callbacks, words
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.analysis import trace
+from tdanet_jax.commands import share
+from tdanet_jax.commands.train_zero_shot import main as train
 from tdanet_jax.config import WORD_VECTORS_FILE, EvalConfig
 from tdanet_jax.evaluation import report, saved_networks
 from tdanet_jax.scenes import SceneTables, dataset

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import tdanet_jax
-from experiments import evaluate
 from tdanet_jax import EvalConfig
+from tdanet_jax.commands import evaluate
 from tdanet_jax.config import OWN_TASK, describe_departures
 from tdanet_jax.env.params import TEST_STEP_LIMITS
 from tdanet_jax.evaluation import comparison, episodes, selection

@@ -45,7 +45,7 @@ def sample(process: int, began: float) -> tuple[float, ...] | None:
 def train(minutes: float, folder: Path, arguments: list[str]) -> np.ndarray:
     """Trains for that long; samples [N, 4] taken while it did so."""
     command = [
-        sys.executable, "-m", "experiments.train_zero_shot", "--minutes",
+        sys.executable, "-m", "tdanet_jax", "train", "--minutes",
         str(minutes), "--checkpoint-minutes", "1", "--tensorboard", "--out", str(folder),
         *arguments,
     ]  # fmt: skip

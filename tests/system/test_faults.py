@@ -23,8 +23,8 @@ from typing import Any
 
 import pytest
 
-from experiments import evaluate as evaluating
-from experiments import train_zero_shot
+from tdanet_jax.commands import evaluate as evaluating
+from tdanet_jax.commands import train_zero_shot
 from tdanet_jax.evaluation import rollout
 from tdanet_jax.io import assets, files
 from tdanet_jax.scenes import cache

@@ -33,6 +33,10 @@ ODOMETRY, TRIANGULATION = "sensors/odometry.py", "sensors/triangulation.py"
 NOISE = "sensors/noise.py"
 TEST_TDANET = "models/test_tdanet.py"
 FAULTS = (
+    Fault("custom code of the working folder is not found", "__main__.py", 'sys.path.append("")',
+          "pass", "commands/test_main.py"),
+    Fault("nobody learns how to trust a run", "commands/running.py", "{trust(config)} tdanet train",
+          "tdanet train", "commands/test_own_model.py"),
     Fault("boxes of a narrow camera as they are", "agent/camera.py",
           "_rays(box, self.hfov, self.vfov or self.hfov)", "_rays(box, 90, 90)", "agent/test_camera.py"),
     Fault("what is kept does not turn", "agent/navigator.py", "turned(found, right,",
@@ -343,7 +347,7 @@ FAULTS = (
     Fault("cut rows stay", "training/journal.py", "file.truncate(", "file.tell() or (",
           "system/test_faults.py"),
     Fault("seeds beyond 32 bits", "config.py", "0 <= seed < 2**32", "0 <= seed",
-          "experiments/test_arguments.py"),
+          "commands/test_arguments.py"),
     Fault("starts drawn anywhere", "evaluation/episodes.py", "valid = positions[reachable[positions, goal]]",
           "valid = positions", "evaluation/test_episodes.py"),
     Fault("padding has a row", "models/shared/class_rows.py", "jnp.where(obs.mask, class_table.row[obs.classes], n)",
@@ -455,9 +459,9 @@ FAULTS = (
     Fault("a resumed run begins its minutes anew", "training/run.py",
           '        self.seconds = float(meta["seconds"])\n', "", "training/test_run_bookkeeping.py"),
     Fault("a flag of the learner is ignored", LEARNER, "steps.bootstrap_only, config.gamma,",
-          "steps.bootstrap_only, 0.99,", "experiments/test_flags.py"),
+          "steps.bootstrap_only, 0.99,", "commands/test_flags.py"),
     Fault("checkpoints every two minutes whatever is said", "workflows/train.py",
-          "> 60 * runs[0].config.checkpoint_minutes", "> 60 * 2.0", "experiments/test_flags.py"),
+          "> 60 * runs[0].config.checkpoint_minutes", "> 60 * 2.0", "commands/test_flags.py"),
     Fault("slivers are visible", "scenes/visibility/build.py", "whole * rules.sliver", "0.0",
           "analysis/test_shown_by_hand.py"),
     Fault("dashes for what is within reach", "analysis/drawing.py",

@@ -36,7 +36,7 @@ def test_a_process_imports_the_code_under_test() -> None:
 def test_a_command_is_the_one_under_test() -> None:
     done = command.run("share")
     assert (done.returncode, done.stdout) == (2, "")
-    assert "Missing from share: --checkpoint RUN" in done.stderr
+    assert "Missing from tdanet share: --checkpoint RUN" in done.stderr
 
 
 def test_no_test_takes_the_working_folder_for_the_checkout() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import tdanet_jax
-from experiments import evaluate
+from tdanet_jax.commands import evaluate
 from tdanet_jax.config import EvalConfig
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.sense_noise import NONE, SenseNoise

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from experiments import benchmark
+from tdanet_jax.commands import benchmark
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.factory import make_model

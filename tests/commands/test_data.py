@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import tdanet_jax
-from experiments import evaluate, scenes, train_zero_shot
 from tdanet_jax.agent.detection import Detection
+from tdanet_jax.commands import evaluate, scenes, train_zero_shot
 from tdanet_jax.io import files
 from tdanet_jax.scenes import SceneTables, dataset
 from tdanet_jax.scenes.offline import features, importer

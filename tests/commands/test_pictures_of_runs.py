@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import attention, evaluate, replay, trajectories
-from experiments.one_episode import Choice
+from tdanet_jax.commands import attention, evaluate, replay, trajectories
+from tdanet_jax.commands.one_episode import Choice
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.scenes import dataset
 from tdanet_jax.scenes.offline import importer

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import tdanet_jax
-from experiments import evaluate, train_zero_shot
+from tdanet_jax.commands import evaluate, train_zero_shot
 from tdanet_jax.io import files
 from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.workflows import train as training
@@ -81,10 +81,7 @@ def test_it_trains_evaluates_and_goes_on_after_kill_and_term(ithor, tmp_path, ca
     said, _ = process.communicate(timeout=600)
     assert process.returncode == 128 + signal.SIGTERM
     assert "half-written when the run was stopped" in said
-    assert (
-        f"updates are saved; continue with: python -m experiments.train_zero_shot --resume {out}"
-        in said
-    )
+    assert f"updates are saved; continue with: tdanet train --resume {out}" in said
     assert not (out / "results.json").exists()
 
     done = command.run("train_zero_shot", "--resume", out)

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from experiments import console, streams
-from tests.experiments.test_arguments import CASES, main_of
+from tdanet_jax.commands import console, streams
+from tests.commands.test_arguments import CASES, main_of
 
 
 class Broken(io.StringIO):

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import console, evaluate
+from tdanet_jax.commands import console, evaluate
 
 
 @pytest.fixture
@@ -131,7 +131,7 @@ def test_a_stop_that_is_dropped_comes_again(
     assert capsys.readouterr().err == "stopped\n"
 
 
-STRIKE = "from tests.experiments.test_console import status, strike\n"
+STRIKE = "from tests.commands.test_console import status, strike\n"
 
 
 def test_a_signal_waits_for_an_import_but_a_second_one_does_not(

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-import experiments
-from experiments.console import console, parse, print_summary, reporter
-from experiments.signals import Stopped, StopRequest
+from tdanet_jax.commands.console import console, parse, print_summary, reporter
+from tdanet_jax.commands.signals import Stopped, StopRequest
 from tdanet_jax.config import CONFIG_FILE, PRESETS, TRUST, TrainConfig
 from tdanet_jax.registry import MODELS
 from tdanet_jax.training.callbacks import Callbacks
@@ -55,7 +54,7 @@ def parse_command(arguments: Sequence[str]) -> Command:
         if word.startswith("--preset"):
             preset = word.partition("=")[2] or "".join(arguments[i + 1 : i + 2])
     default = Command(run=PRESETS.get(preset, PRESETS["default"]))
-    return parse(Command, arguments, default=default, prog="train_zero_shot")
+    return parse(Command, arguments, default=default, prog="tdanet train")
 
 
 @contextlib.contextmanager
@@ -146,6 +145,5 @@ def how_to_continue(folder: Path, config: TrainConfig) -> str:
 
     if not (folder / CONFIG_FILE).exists():
         return "the run had not begun"
-    name = "tdanet train" if experiments.subcommand else "python -m experiments.train_zero_shot"
-    again = f"{trust(config)} {name} --resume {folder}".lstrip()
+    again = f"{trust(config)} tdanet train --resume {folder}".lstrip()
     return f"{Checkpoints(folder).latest() or 0:,} updates are saved; continue with: {again}"

@@ -8,11 +8,13 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import json
+import pkgutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tdanet_jax import commands
 from tdanet_jax import config as configs
 from tdanet_jax.config import TrainConfig
 from tests.support import command
@@ -111,7 +113,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--out full/file/below", "full/file/below: Not a directory"),
     ],
     "share": [
-        ("", "Missing from share: --checkpoint RUN"),
+        ("", "Missing from tdanet share: --checkpoint RUN"),
         ("--checkpoint bare --out full", "--out full: exists and is not empty"),
         ("--checkpoint bare --out new", "bare: no checkpoint"),
         ("--checkpoint bare --out full/file/below", "--out full/file/below: Not a directory"),
@@ -127,7 +129,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--out full", "--out full: is a folder"),
     ],
     "serve": [
-        ("", "Missing from serve: --checkpoint RUN"),
+        ("", "Missing from tdanet serve: --checkpoint RUN"),
         ("--checkpoint nowhere", "nowhere/config.json: no such file"),
         ("--checkpoint bare", "bare/checkpoints: no checkpoint"),
         ("--checkpoint bare --hfov 200 --vfov 50", "camera: hfov 200.0: must be between 5 and 180"),
@@ -167,7 +169,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint bare --episode 3 --out full/file/a.gif", "full/file/a.gif: Not a directory"),
     ],
     "attention": [
-        ("", "Missing from attention: --checkpoint"),
+        ("", "Missing from tdanet attention: --checkpoint"),
         ("--checkpoint bare --scene FloorPlan1", "give --scene and --target, or --episode"),
         ("--checkpoint bare", "bare/checkpoints: no checkpoint"),
         ("--checkpoint bare --out full/file", "--out full/file: is a file"),
@@ -175,7 +177,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint bare --seed=-1", "--seed -1: must be between 0 and 4294967295"),
     ],
     "sweep": [
-        ("", "Missing from sweep: --out"),
+        ("", "Missing from tdanet sweep: --out"),
         ("--out new --seed 3", "a sweep takes"),
         ("--out new --splits 17/5", "--split 17/5: choose one of 22/0, 18/4, 14/8"),
         ("--out new --splits Mug,CD CD,Mug", "--splits: a value is given twice"),
@@ -202,7 +204,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("verify --rooms 121", "--rooms 121: at most 120"),
         ("verify --views 5000", "--views 5000: at most 560"),
         ("verify --views x", "invalid literal for int() with base 10: 'x'"),
-        ("inspect", "Missing from scenes inspect: STR"),
+        ("inspect", "Missing from tdanet scenes inspect: STR"),
         (
             "inspect FloorPlan0",
             "FloorPlan0: no such room; there are FloorPlan1-30, FloorPlan201-230, F",
@@ -216,7 +218,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("inspect FloorPlan1 --variants=-1", "--variants -1: must be positive"),
         ("inspect FloorPlan1 --variants 401", "--variants 401: at most 400"),
         ("inspect FloorPlan1 --variants 1 --rotation 90", "--variants takes no --position, --rot"),
-        ("vary", "Missing from scenes vary: --out PATH"),
+        ("vary", "Missing from tdanet scenes vary: --out PATH"),
         ("vary --out full", "--out full: exists"),
         ("vary --out no/a.npz", "--out no/a.npz: no such folder"),
         ("vary --out a.npz --copies 0", "--copies 0: must be positive"),
@@ -224,13 +226,13 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("vary --out a.npz --seed=-1", "--seed -1: must be between 0 and"),
         ("vary --out a.npz --part half", "invalid choice 'half' for argument '--part'"),
         ("vary --out a.npz --data full/file", "full/file: not an npz archive"),
-        ("generate", "Missing from scenes generate: --out PATH"),
+        ("generate", "Missing from tdanet scenes generate: --out PATH"),
         ("generate --out full", "--out full: exists"),
         ("generate --out no/a.npz", "--out no/a.npz: no such folder"),
         ("generate --out a.npz --rooms 0", "--rooms 0: must be positive"),
         ("generate --out a.npz --rooms 10001", "--rooms 10001: at most 10,000"),
         ("generate --out a.npz --seed=-1", "--seed -1: must be between 0 and"),
-        ("compare", "Missing from scenes compare: STR"),
+        ("compare", "Missing from tdanet scenes compare: STR"),
         ("compare nope.npz", "nope.npz: no such file"),
         ("build --wheels wheels --out full/file", "--out full/file: is a file"),
         ("export --out full/file/below", "--out full/file/below: Not a directory"),
@@ -292,8 +294,8 @@ def assert_one_line(said: str, message: str) -> None:
 
 
 def main_of(name: str) -> Callable[[list[str]], None]:
-    """The function behind `python -m experiments.NAME`."""
-    main: Callable[[list[str]], None] = importlib.import_module(f"experiments.{name}").main
+    """The function behind a command."""
+    main: Callable[[list[str]], None] = importlib.import_module(f"tdanet_jax.commands.{name}").main
     return main
 
 
@@ -326,6 +328,6 @@ def test_in_a_process_of_its_own(name: str) -> None:
 
 
 def test_every_command_is_in_the_table() -> None:
-    here = Path(importlib.import_module("experiments").__path__[0])
-    commands = {path.stem for path in here.glob("*.py") if "\ndef main(" in path.read_text()}
-    assert commands - {"__main__"} == set(CASES)
+    names = [found.name for found in pkgutil.iter_modules(commands.__path__)]
+    modules = {name: importlib.import_module(f"tdanet_jax.commands.{name}") for name in names}
+    assert {name for name, module in modules.items() if hasattr(module, "main")} == set(CASES)

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import tdanet_jax
-from experiments.running import how_to_continue
 from tdanet_jax.agent.detection import Detection
+from tdanet_jax.commands.running import how_to_continue
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.factory import make_model
@@ -25,8 +25,8 @@ def test_the_example_on_the_page_is_a_model(
 ) -> None:
     (tmp_path / "my_lab").mkdir()
     (tmp_path / "my_lab" / "most_alike.py").write_text(block("models.md", "most_alike.py"))
-    python, _, module, *given = shlex.split(block("models.md", "most_alike command"))
-    assert (python, module) == ("python", "experiments.train_zero_shot")
+    program, name, *given = shlex.split(block("models.md", "most_alike command"))
+    assert (program, name) == ("tdanet", "train")
     small = ("--steps", "400", "--history", "0", *command.TINY)
     here = {"PYTHONSAFEPATH": ""}  # the model is in the working folder
     done = command.run("train_zero_shot", *given, *small, cwd=tmp_path, variables=here)
@@ -49,7 +49,7 @@ def test_the_example_on_the_page_is_a_model(
 
 def test_who_stops_a_run_of_a_custom_model_learns_how_to_trust_it(tmp_path):
     (tmp_path / "config.json").touch()
-    again = f"python -m experiments.train_zero_shot --resume {tmp_path}"
+    again = f"tdanet train --resume {tmp_path}"
     said = how_to_continue(tmp_path, TrainConfig(model="my_lab.most_alike"))
     assert said.endswith(f"continue with: TDANET_TRUST=my_lab.most_alike {again}")
     assert how_to_continue(tmp_path, TrainConfig(model="savn")).endswith(f"continue with: {again}")

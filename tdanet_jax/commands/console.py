@@ -14,19 +14,21 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-import experiments
-from experiments.signals import Stopped, StopRequest
-from experiments.streams import ends_with_its_reader
+from tdanet_jax.commands.signals import Stopped, StopRequest
+from tdanet_jax.commands.streams import ends_with_its_reader
 from tdanet_jax.io import files
 from tdanet_jax.io.bundled_agents import find_run, is_bundled
 from tdanet_jax.io.escaping import in_line, in_terminal
 from tdanet_jax.splits import GROUPS
+
+if TYPE_CHECKING:
+    from tdanet_jax.scenes.dataset import Rooms
 
 Arguments = TypeVar("Arguments")
 
@@ -128,8 +130,6 @@ def whole_number(text: str) -> int:
 
 def parse(command: type[Arguments], arguments: Sequence[str] | None, **options: Any) -> Arguments:
     """`tyro.cli`, with errors in one line."""
-    if experiments.subcommand is not None:
-        options["prog"] = f"tdanet {experiments.subcommand}"
     with one_line_usage():
         return tyro.cli(command, args=arguments, **options)
 
@@ -172,6 +172,13 @@ def check_new_file(path: Path, in_folder: bool = True) -> None:
     if in_folder and not path.absolute().parent.is_dir():
         fail(f"--out {path}: no such folder")
     files.check_writable(path)
+
+
+def remove_abandoned(*outs: Path) -> None:
+    """Removes the unfinished versions of --out that killed processes left."""
+    for out in outs:
+        for path in files.remove_abandoned(out):
+            console.print(f"removed {path}: half-written when its command was killed")
 
 
 def check_picture(out: Path) -> None:
@@ -257,6 +264,14 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
         console.print(f"{title} {100 * share:5.1f} %  {figures}{left}".rstrip())
 
     yield plain
+
+
+def load_rooms(data: str | None) -> Rooms:
+    """The rooms of a file, or the bundled ones, with progress while they are rebuilt."""
+    from tdanet_jax.scenes import dataset
+
+    with reporter("rooms", transient=True) as report:
+        return dataset.load_rooms(data, lambda done, total: report(done / total, "rebuilt"))
 
 
 def print_summary(results: Mapping[str, Any]) -> None:

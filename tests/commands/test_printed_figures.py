@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import benchmark, console, one_episode, running
-from experiments.signals import StopRequest
 from tdanet_jax.analysis.trace import Trace
+from tdanet_jax.commands import benchmark, console, one_episode, running
+from tdanet_jax.commands.signals import StopRequest
 from tdanet_jax.vocabulary import Action
 
 ROW: dict[str, Any] = {

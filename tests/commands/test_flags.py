@@ -26,8 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import scenes as scenes_command
 from tdanet_jax import config as configs
+from tdanet_jax.commands import scenes as scenes_command
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.env.params import make_params
 from tdanet_jax.env.reward import no_parents
@@ -119,9 +119,9 @@ def agents(recorder: Recorder, last: str) -> None:
     recorder.record("tdanet_jax.analysis.trace.retrace", gives=TRACE)
     recorder.record("tdanet_jax.analysis.trace.Player", gives="the shortest path")
     recorder.record("tdanet_jax.scenes.floor_plan.of_room", "tdanet_jax.analysis.replay.page")
-    recorder.record("experiments.attention.play_lists", gives=dict)
-    recorder.record("experiments.attention.write_pairs", gives=None)
-    recorder.record("experiments.attention.example", gives=TRACE)
+    recorder.record("tdanet_jax.commands.attention.play_lists", gives=dict)
+    recorder.record("tdanet_jax.commands.attention.write_pairs", gives=None)
+    recorder.record("tdanet_jax.commands.attention.example", gives=TRACE)
     recorder.record(last, gives=Ended)
 
 
@@ -153,7 +153,7 @@ def prepare_benchmark(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.tools.benchmarking.share_of_peak", gives=dict)
     recorder.record("tdanet_jax.tools.benchmarking.machine_row", *BENCHMARKS, gives=row)
     for part in ("tables", "import", "startup"):
-        recorder.record(f"experiments.benchmark.{part}_row", gives=row)
+        recorder.record(f"tdanet_jax.commands.benchmark.{part}_row", gives=row)
 
 
 def prepare_scaling(recorder: Recorder) -> None:
@@ -161,7 +161,9 @@ def prepare_scaling(recorder: Recorder) -> None:
     task = SimpleNamespace(train_words=np.zeros((117, 2)), train_params=params, model="a model")
     recorder.record("tdanet_jax.task.make_task", gives=task)
     recorder.record("tdanet_jax.scenes.load_tables", "tdanet_jax.words.load_bundled")
-    recorder.record("experiments.scaling.with_rooms", "experiments.scaling.with_detections")
+    recorder.record(
+        "tdanet_jax.commands.scaling.with_rooms", "tdanet_jax.commands.scaling.with_detections"
+    )
     recorder.record("tdanet_jax.tools.benchmarking.update_cost", gives=row)
     recorder.record("tdanet_jax.analysis.figures.scaling", gives=Ended)
 
@@ -202,14 +204,14 @@ def prepare_scenes(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.scenes.offline.features.save_with_maps", gives=Ended)
     recorder.record("tdanet_jax.env.reward.named_parents", gives=dict)
     recorder.record("tdanet_jax.scenes.offline.exporter.check_layout", gives=None)
-    recorder.record("experiments.scenes.test_starts", gives=())
+    recorder.record("tdanet_jax.commands.scenes.export.test_starts", gives=())
     vectors = SimpleNamespace(table=lambda *names: "vectors")
     recorder.record("tdanet_jax.words.load_word_vectors", gives=vectors)
     recorder.record("tdanet_jax.scenes.offline.exporter.write_folder", gives=Ended)
     recorder.record("tdanet_jax.scenes.collect.collect", gives="found")
     recorder.record("tdanet_jax.scenes.collect.write_scenes", gives=None)
     controller = SimpleNamespace(stop=lambda: None)
-    recorder.record("experiments.scenes._start_ai2thor", gives=controller)
+    recorder.record("tdanet_jax.commands.scenes.collect._start_ai2thor", gives=controller)
 
 
 def prepare_sweep(recorder: Recorder) -> None:
@@ -217,7 +219,7 @@ def prepare_sweep(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.workflows.sweep.finished", gives=finished)
     recorder.record("tdanet_jax.training.devices.connect")
     recorder.record("tdanet_jax.workflows.train.train", "tdanet_jax.workflows.train.train_together")
-    recorder.record("experiments.sweep.write_report")
+    recorder.record("tdanet_jax.commands.sweep.write_report")
 
 
 def prepare_serve(recorder: Recorder) -> None:
@@ -225,8 +227,8 @@ def prepare_serve(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.agent.agent.load", gives=agent)
     recorder.record("tdanet_jax.training.devices.keep_compiled", gives=None)
     navigator = SimpleNamespace(camera=SimpleNamespace(limits=tuple))
-    recorder.record("experiments.serve.Navigator", gives=navigator)
-    recorder.record("experiments.serve.read_lines", gives=Ended)
+    recorder.record("tdanet_jax.commands.serve.Navigator", gives=navigator)
+    recorder.record("tdanet_jax.commands.serve.read_lines", gives=Ended)
 
 
 #: Command -> how its functions are recorded.
@@ -234,7 +236,7 @@ PREPARE: dict[str, Callable[[Recorder], None]] = {
     "train_zero_shot": lambda r: r.record("tdanet_jax.workflows.train.train"),
     "evaluate": lambda r: r.record("tdanet_jax.workflows.evaluate.evaluate", gives=Ended),
     "share": lambda r: r.record("tdanet_jax.evaluation.saved_networks.share", gives=Ended),
-    "demo": lambda r: r.record("experiments.demo.show", "webbrowser.open", gives=None),
+    "demo": lambda r: r.record("tdanet_jax.commands.demo.show", "webbrowser.open", gives=None),
     "serve": prepare_serve,
     "replay": lambda r: agents(r, "tdanet_jax.io.files.write_text"),
     "trajectories": lambda r: agents(r, "tdanet_jax.analysis.pictures.trajectories"),
@@ -468,7 +470,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def asked(command: str, words: str, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What the functions behind a command are asked to do, and the files that it writes itself."""
     name, _, sub = command.partition(" ")
-    main = importlib.import_module(f"experiments.{name}").main
+    main = importlib.import_module(f"tdanet_jax.commands.{name}").main
     for path in Path().iterdir():
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     for run in ("run", "other"):
@@ -512,7 +514,7 @@ def flags_of(command: type) -> Iterator[str]:
 
 
 def test_every_flag_has_a_row() -> None:
-    modules = {name: importlib.import_module(f"experiments.{name}") for name in PREPARE}
+    modules = {name: importlib.import_module(f"tdanet_jax.commands.{name}") for name in PREPARE}
     classes = {name: m.Command for name, m in modules.items() if name != "scenes"}
     classes |= {f"scenes {name}": one for name, one in scenes_command.COMMANDS.items()}
     for name, command in classes.items():
@@ -528,7 +530,7 @@ SHOWN = {
     "_gradient_of_the_loss",
     "bootstrap_truncated": "training/test_learner.py::test_rollouts_follow_the_slow_world_and_value"
     "_time_outs_in_one_more_step",
-    "image": "experiments/test_pictures_of_runs.py::test_a_model_that_was_trained_on_feature_maps"
+    "image": "commands/test_pictures_of_runs.py::test_a_model_that_was_trained_on_feature_maps"
     "_sees_those_of_the_rooms",
     "steps": "training/test_run.py::test_the_budget_in_steps_is_kept_and_every_chunk_has_a_row",
     "episodes": "training/test_run.py::test_the_budget_in_episodes_ends_the_run",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import importlib
 import json
 import re
 import shlex
@@ -13,12 +12,13 @@ from typing import Any
 
 import pytest
 
-from experiments import scenes
+from tdanet_jax import __main__ as tdanet
+from tdanet_jax.commands import scenes
 from tdanet_jax.poses import PoseGrid
 from tdanet_jax.scenes import SceneTables, dataset, records
 from tdanet_jax.scenes import ithor as bundled
 from tdanet_jax.scenes.dataset import Extras, Rooms
-from tests.experiments.test_data import fails
+from tests.commands.test_data import fails
 from tests.scenes.test_metadata import DOCUMENT
 from tests.support.command import TINY
 from tests.support.pages import block
@@ -42,9 +42,9 @@ def run_commands(commands: str, trained: bool, *flags: str) -> None:
     if trained:
         lines.append(shlex.join([*shlex.split(train), "--steps", "80", *flags, *TINY]))
     for line in lines:
-        python, _, module, *given = shlex.split(line)
-        assert python == "python"
-        importlib.import_module(module).main(given)
+        program, *given = shlex.split(line)
+        assert program == "tdanet"
+        tdanet.main(given)
 
 
 @both

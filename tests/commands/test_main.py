@@ -1,20 +1,19 @@
-"""`tdanet NAME` is `python -m experiments.MODULE`, under one name."""
+"""`tdanet NAME`, and `python -m experiments.MODULE` from a clone."""
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-import experiments
-from experiments import __main__ as tdanet
-from experiments.running import how_to_continue
+from tdanet_jax import __main__ as tdanet
 from tdanet_jax import __version__
-from tdanet_jax.config import CONFIG_FILE, TrainConfig
-from tests.experiments.test_arguments import CASES
+from tests.commands.test_arguments import CASES
 
+ROOT = Path(__file__).resolve().parents[2]
 Capture = pytest.CaptureFixture[str]
 
 
@@ -55,7 +54,6 @@ def test_wrong_arguments_are_one_line(words: list[str], message: str, capsys: Ca
     said = capsys.readouterr().err
     assert said.startswith(f"error: {message}")
     assert said.count("\n") == 1
-    assert experiments.subcommand is None
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
@@ -68,31 +66,48 @@ def test_shells_complete_commands_and_flags(shell: str, capsys: Capture) -> None
         assert word in script
 
 
-def test_a_stopped_run_says_how_to_continue_under_the_same_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / CONFIG_FILE).touch()
-    ends = f" --resume {tmp_path}"
-    assert how_to_continue(tmp_path, TrainConfig()).endswith(
-        f"python -m experiments.train_zero_shot{ends}"
-    )
-    monkeypatch.setattr(experiments, "subcommand", "train")
-    assert how_to_continue(tmp_path, TrainConfig()).endswith(f": tdanet train{ends}")
-
-
-#: What the script does that an installation makes.
+#: The script that an installation makes.
 SCRIPT = """
-import sys
-from experiments.__main__ import script
-sys.argv = ["/bin/tdanet", "evaluate", "--policy", "x"]
+from tdanet_jax.__main__ import script
 script()
 """
 
 
-def test_as_a_program() -> None:
+def test_as_a_program_with_a_model_of_the_working_folder(tmp_path: Path) -> None:
+    for folder in ("bin", "my_lab"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "bin" / "tdanet").write_text(SCRIPT)
+    (tmp_path / "my_lab" / "empty.py").touch()
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False
+        [sys.executable, "bin/tdanet", "train", "--model", "my_lab.empty"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONSAFEPATH": ""},
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 2
-    assert done.stderr.startswith("error: invalid choice 'x'")
-    assert done.stderr.count("\n") == 1
+    assert done.stderr == "error: --model my_lab.empty: the module has no function `make`\n"
+
+
+#: A file of `experiments/`.
+FROM_A_CLONE = """\
+\"""`{command}`, from a clone.\"""
+
+from __future__ import annotations
+
+from tdanet_jax.{module} import main
+
+if __name__ == "__main__":
+    main()
+"""
+
+
+def test_a_clone_has_a_file_for_every_command() -> None:
+    written = {path.stem: path.read_text() for path in (ROOT / "experiments").glob("*.py")}
+    del written["__init__"]
+    known = [("__main__", "__main__", "tdanet")]
+    known += [(m, f"commands.{m}", f"tdanet {name}") for name, (m, _) in tdanet.COMMANDS.items()]
+    assert written == {
+        file: FROM_A_CLONE.format(command=command, module=module) for file, module, command in known
+    }

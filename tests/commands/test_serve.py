@@ -1,4 +1,4 @@
-"""`experiments.serve`: one line in, one line out."""
+"""`tdanet serve`: one line in, one line out."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from experiments import serve
+from tdanet_jax.commands import serve
 from tests.agent.test_agent import OLD_RUN
 
 FRAME = {"detections": [{"label": "sink", "box": [0.1, 0.3, 0.5, 0.8]}], "blocked": False}

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from experiments import scaling
+from tdanet_jax.commands import scaling
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.task import make_task
 from tdanet_jax.tools import benchmarking

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from experiments.console import RunPath, console, fail, reporter
 from tdanet_jax import config as configs
+from tdanet_jax.commands.console import RunPath, console, fail, load_rooms
 from tdanet_jax.config import CONFIG_FILE, EvalConfig
+from tdanet_jax.io.bundled_agents import folder_of
 from tdanet_jax.poses import TURNS
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ class Choice:
     seed: int = 0
     """Seed for drawing the start and sampling actions."""
     data: str | None = None
-    """File of rooms that `experiments.scenes import` wrote; by default, the first run's rooms."""
+    """File of rooms that `tdanet scenes import` wrote; by default, the first run's rooms."""
     word_vectors: str | None = None
     """File of word vectors, instead of the copies that the runs hold of their own."""
     policy: Literal["sample", "greedy"] = "sample"
@@ -85,25 +86,18 @@ def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
         fail("give --scene and --target, or --episode")
 
 
-def folder_of(run: Path) -> Path:
-    """The folder of a run, or of the run of a point of history (`history/<updates>.npz`)."""
-    return run.parent.parent if run.suffix == ".npz" else run
-
-
-def load_rooms(choice: Choice, runs: Sequence[Path]) -> Rooms:
+def rooms_of(choice: Choice, runs: Sequence[Path]) -> Rooms:
     """The rooms of --data or of the first run, with --target among the targets if it is a class.
 
     Shows progress if they are rebuilt.
     """
     from tdanet_jax.labels import Labels
-    from tdanet_jax.scenes import dataset
     from tdanet_jax.scenes.target_distances import with_targets
 
     run = folder_of(runs[0])
     files = EvalConfig(data=choice.data, word_vectors=choice.word_vectors)
     data = files.locate(configs.load(run / CONFIG_FILE), run).data
-    with reporter("rooms", transient=True) as report:
-        rooms = dataset.load_rooms(data, lambda done, total: report(done / total, "rebuilt"))
+    rooms = load_rooms(data)
     classes = rooms.tables.classes
     sought = Labels(classes).find(choice.target) if choice.target else None
     asked = [sought] if sought in classes else []
@@ -153,7 +147,7 @@ def play_runs(command: Comparison) -> tuple[list[Trace], SceneTables]:
     devices.keep_compiled()
     devices.start()
     choice, runs = command.choice, command.checkpoint
-    players = load_players(choice, runs, load_rooms(choice, runs))
+    players = load_players(choice, runs, rooms_of(choice, runs))
     tables = players[0].task.tables
     if command.shortest:
         players.append(trace.Player("shortest path", players[0].task))

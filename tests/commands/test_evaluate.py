@@ -11,8 +11,8 @@ import jax
 import pytest
 
 import tdanet_jax
-from experiments import evaluate
 from tdanet_jax import config as configs
+from tdanet_jax.commands import evaluate
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.evaluation import report, saved_networks
 from tdanet_jax.evaluation.saved_networks import SavedNetwork

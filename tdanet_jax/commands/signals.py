@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any, NoReturn
 
-import experiments
+from tdanet_jax import commands
 
 #: Seconds after which a stop that waits for an import, or was dropped, is raised again.
 RETRY_SECONDS = 0.05
@@ -35,8 +35,8 @@ class Stopped(KeyboardInterrupt):
     def answer(self) -> NoReturn:
         """Ends the program."""
         self._request.signal = None
-        experiments.exit_status = 128 + self.signal
-        raise SystemExit(experiments.exit_status) from None
+        commands.exit_status = 128 + self.signal
+        raise SystemExit(commands.exit_status) from None
 
 
 class StopRequest:

@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from experiments import evaluate, sweep
+from tdanet_jax.commands import evaluate, sweep
 from tdanet_jax.io import files
 from tdanet_jax.workflows.sweep_report import Cost
 from tests.evaluation.test_comparison import result
@@ -32,7 +32,7 @@ RUN_FILES = {
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "Missing from sweep: --out"),
+        ([], "Missing from tdanet sweep: --out"),
         (["--out=x", "--split", "14/8"], "--split: a sweep takes --splits"),
         (["--out=x", "--splits", "17/5"], "--split 17/5: choose one of"),
         (["--out=x", "--models", "cnn"], "--model cnn: choose one of"),

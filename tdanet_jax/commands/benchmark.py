@@ -1,0 +1,300 @@
+"""Measures speed on this machine, with compilation and run time apart.
+
+    tdanet benchmark --out benchmark.jsonl
+
+Every value is the median over repetitions. Shares of the peak count 6 floating-point operations
+(forward and backward) for each multiply-accumulate of a forward step, by a formula; work that is
+done twice counts once. The peak is the best rate of a float32 product of batch x 1024 by
+1024 x 2048, measured in the same run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, get_args
+
+from rich.table import Table
+
+from tdanet_jax.commands.console import (
+    RunPath,
+    check_positive,
+    console,
+    fail,
+    one_line_errors,
+    parse,
+)
+from tdanet_jax.config import NetworkConfig, TrainConfig
+
+if TYPE_CHECKING:
+    from jax.sharding import Mesh
+
+    from tdanet_jax.task import Task
+    from tdanet_jax.tools.benchmarking import Row
+
+Part = Literal[
+    "tables", "import", "startup", "machine", "environment", "rollout", "update", "evaluation",
+    "decision",
+]  # fmt: skip
+Precision = Literal["auto", "float32", "bfloat16"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Measures the speed of environment, rollout, update, evaluation and decisions."""
+
+    parts: tuple[Part, ...] = get_args(Part)
+    """What to measure."""
+    environments: tuple[int, ...] = (1024, 4096, 16384)
+    """Numbers of environments in the `environment` part."""
+    batches: tuple[int, ...] = (256, 512, 1024)
+    """Numbers of environments in the `rollout` and `update` parts."""
+    precisions: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
+    """Precision of the matrix products in the `rollout` and `update` parts."""
+    networks: tuple[int, ...] = (1,)
+    """Numbers of networks that are evaluated in one call; 20 is a run's history."""
+    checkpoint: RunPath | None = None
+    """Run whose trained network the `evaluation` part plays; by default an untrained one."""
+    models: tuple[str, ...] = ("tdanet",)
+    """Models of the `rollout`, `update` and `decision` parts."""
+    odometry: bool = False
+    """Give these models odometry, as the training command does."""
+    triangulation: bool = False
+    """With --odometry, also give them triangulation."""
+    data: str | None = None
+    """File of rooms that `tdanet scenes import` wrote, instead of the bundled ones."""
+    devices: int = 1
+    """Devices that the environments of the `environment` part are split over; a CPU is split into
+    as many."""
+    repeats: int = 5
+    """Repetitions of each measurement."""
+    out: Path | None = None
+    """File for the results, one JSON object per line, written as they come; must not exist."""
+
+    def config(self, model: str, precision: Precision = "auto") -> TrainConfig:
+        """The run whose model and rooms are measured."""
+        network = NetworkConfig(
+            odometry=self.odometry, triangulation=self.triangulation, precision=precision
+        )
+        return TrainConfig(model=model, network=network, data=self.data)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command."""
+    with one_line_errors():
+        command = parse(Command, arguments, prog="tdanet benchmark")
+        if command.out is not None and command.out.exists():
+            fail(f"--out {command.out}: exists")
+        check_positive(
+            repeats=command.repeats,
+            devices=command.devices,
+            environments=command.environments,
+            batches=command.batches,
+            networks=command.networks,
+        )
+        for name in command.models:
+            command.config(name).check()
+        if command.odometry and not {"rollout", "update", "decision"} & set(command.parts):
+            fail("--odometry: none of the --parts has a model; choose rollout, update or decision")
+        if command.checkpoint is not None:
+            from tdanet_jax.evaluation import saved_networks
+
+            saved_networks.find(command.checkpoint)  # an error shows now, not after minutes
+        from tdanet_jax.training import devices
+
+        mesh = devices.connect(command.devices)
+        if "environment" in command.parts:
+            for count in command.environments:
+                devices.check_divides(count, mesh, "environments")
+        rows = []
+        with contextlib.nullcontext() if command.out is None else command.out.open("x") as file:
+            for row in measure(command, mesh):
+                rows.append(row)
+                line = json.dumps(row)
+                console.print(line)
+                if file is not None:
+                    file.write(line + "\n")
+                    file.flush()
+        console.print(as_table(rows))
+
+
+def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
+    """All results that were asked for, one row each.
+
+    Args:
+      mesh: the devices that environments are split over.
+    """
+    import jax
+
+    from tdanet_jax.task import load_task
+    from tdanet_jax.tools import benchmarking
+
+    machine = {"processor": benchmarking.processor(), "jax": jax.__version__}
+    yield {"part": "start", "device": str(jax.devices()[0]), **machine}
+    if "tables" in command.parts:
+        yield tables_row()
+    task = load_task(TrainConfig(data=command.data))
+    if "import" in command.parts:
+        yield import_row(task)
+    if "startup" in command.parts:
+        yield startup_row()
+    peak = None
+    if "machine" in command.parts:
+        row = benchmarking.machine_row(command.repeats)
+        peak = row["float32_gflops"]
+        yield row
+    if "environment" in command.parts:
+        for count in command.environments:
+            for observed in (False, True):
+                yield benchmarking.environment_row(task, count, observed, command.repeats, mesh)
+    if "evaluation" in command.parts:
+        for networks in command.networks:
+            yield benchmarking.evaluation_row(command.checkpoint, task, networks, command.repeats)
+    sensors = {"odometry": command.odometry, "triangulation": command.triangulation}
+    for name in command.models:
+        for row in model_rows(command, name, peak):
+            yield {"part": row.pop("part"), "model": name, **sensors, **row}
+
+
+def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]:
+    """The results of a model: acting, updates, and one decision.
+
+    Args:
+      peak: rate of float32 products, GFLOP/s; None if it was not measured.
+    """
+    import jax.numpy as jnp
+
+    from tdanet_jax.task import load_task
+    from tdanet_jax.tools import benchmarking
+
+    repeats, measured = command.repeats, set()
+    for asked in command.precisions if {"rollout", "update"} & set(command.parts) else ():
+        task = load_task(command.config(name, asked))
+        precision = jnp.dtype(task.model.dtype).name
+        if precision in measured:  # some models always multiply in float32
+            continue
+        measured.add(precision)
+        for count in command.batches:
+            if "rollout" in command.parts:
+                yield benchmarking.rollout_row(task, count, repeats) | {"precision": precision}
+            if "update" in command.parts:
+                row = benchmarking.update_row(task, count, repeats)
+                share = benchmarking.share_of_peak(task, row, peak) if name == "tdanet" else {}
+                yield {**row, **share, "precision": precision}
+    if "decision" in command.parts:
+        task = load_task(command.config(name))
+        for count in (1, 1024):
+            yield benchmarking.decision_row(task, count, repeats)
+
+
+def tables_row() -> Row:
+    """Time to compute the tables of the bundled rooms, to save and to load them; peak memory."""
+    from tdanet_jax.scenes import ithor
+    from tdanet_jax.scenes.tables import SceneTables
+    from tdanet_jax.scenes.tabulation import build
+
+    began = time.perf_counter()
+    tables = build(ithor.load_scenes())
+    built = time.perf_counter()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "tables.npz"
+        tables.save(path)
+        saved = time.perf_counter()
+        SceneTables.load(path)
+        loaded = time.perf_counter()
+        size = path.stat().st_size
+    return {
+        "part": "tables",
+        "rooms": len(tables.scenes),
+        "build_seconds": round(built - began, 2),
+        "save_seconds": round(saved - built, 2),
+        "load_seconds": round(loaded - saved, 2),
+        "peak_memory_gb": round(peak / 1e9, 2),
+        "file_mb": round(size / 1e6, 1),
+    }
+
+
+def import_row(task: Task) -> Row:
+    """Time to export the rooms to the original offline layout and to import them again.
+
+    The import is the command that a user types; the peak memory is that of its process.
+    """
+    from tdanet_jax.scenes.offline import exporter
+
+    with tempfile.TemporaryDirectory() as place:
+        folder, out = Path(place) / "original", Path(place) / "rooms.npz"
+        began = time.perf_counter()
+        exporter.write_folder(task.tables, folder, lambda share, name: None)
+        written = time.perf_counter()
+        command = [sys.executable, "-m", "tdanet_jax", "scenes", "import", "--from", str(folder)]
+        done = subprocess.run([*command, "--out", str(out)], capture_output=True, text=True)
+        if done.returncode:
+            raise ValueError(f"import: {done.stderr.strip()}")
+        read = time.perf_counter()
+        size = sum(path.stat().st_size for path in folder.rglob("*.json"))
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    return {
+        "part": "import",
+        "rooms": len(task.tables.scenes),
+        "folder_mb": round(size / 1e6, 1),
+        "export_seconds": round(written - began, 2),
+        "import_seconds": round(read - written, 2),
+        "peak_memory_gb": round(peak / 1e9, 2),
+    }
+
+
+def startup_row() -> Row:
+    """Time from the start of the training command to its first update, and of `--help`.
+
+    The rooms' tables are cached; once nothing is compiled, once the first start has compiled it.
+    """
+    from tdanet_jax.scenes import cache
+
+    train = [sys.executable, "-m", "tdanet_jax", "train"]
+    row: Row = {"part": "startup"}
+    with tempfile.TemporaryDirectory() as place:
+        home = Path(place)
+        for path in cache.folder().glob(f"ithor-{cache.key()}.*"):
+            shutil.copy(path, home)
+        for name in ("nothing_compiled", "compiled_before"):
+            metrics = home / name / "metrics.jsonl"
+            began = time.perf_counter()
+            with subprocess.Popen(
+                [*train, "--chunk-updates", "1", "--out", str(metrics.parent)],
+                env=os.environ | {cache.VARIABLE: str(home)},
+                stdout=subprocess.DEVNULL,
+            ) as process:
+                while not metrics.exists():
+                    if process.poll() is not None:
+                        raise ValueError("startup: the training command ended early")
+                    time.sleep(0.01)
+                row[f"seconds_{name}"] = round(time.perf_counter() - began, 2)
+                process.kill()
+    began = time.perf_counter()
+    subprocess.run([*train, "--help"], check=True, stdout=subprocess.DEVNULL)
+    return row | {"seconds_help": round(time.perf_counter() - began, 2)}
+
+
+def as_table(rows: list[Row]) -> Table:
+    """All rows as one table: the part, its setting, and its results."""
+    table = Table("part", "setting", "results")
+    settings = (
+        "environments", "devices", "observations", "precision", "model", "odometry",
+        "triangulation", "batch", "networks", "episodes",
+    )  # fmt: skip
+    for row in rows:
+        setting = ", ".join(f"{k} {row[k]}" for k in settings if k in row)
+        results = ", ".join(f"{k} {v}" for k, v in row.items() if k not in (*settings, "part"))
+        table.add_row(row["part"], setting, results)
+    return table

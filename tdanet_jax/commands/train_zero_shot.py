@@ -1,0 +1,84 @@
+"""Trains an agent on the iTHOR training rooms and reports SR and SPL in the test rooms.
+
+    tdanet train --split 18/4
+
+Writes config.json, classes.json, metrics.jsonl, checkpoints, results.json, results.md,
+episodes.jsonl and learning_curve.png into --out (by default
+runs/<split>-<model>-seed<seed>-<time>).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import os
+import sys
+import time
+from pathlib import Path
+
+from tdanet_jax.commands.console import check_positive, console, fail, one_line_errors
+from tdanet_jax.commands.running import Command, how_to_continue, parse_command, stoppable, trust
+from tdanet_jax.commands.streams import output_may_break
+from tdanet_jax.config import TrainConfig, run_name
+from tdanet_jax.io import files
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command."""
+    words = sys.argv[1:] if arguments is None else arguments
+    with one_line_errors():
+        command = parse_command(words)
+        config = check(command)
+        folder = command.resume or command.out or default_folder(config)
+        joined = bool(os.environ.get("JAX_COORDINATOR_ADDRESS"))
+        if command.resume is None and not joined:
+            files.check_empty(folder, f" (to continue there: --resume {folder})")
+        with output_may_break():
+            run(command, config, folder)
+
+
+def check(command: Command) -> TrainConfig:
+    """The run's configuration; fails early on flags that do not go together."""
+    config = command.run
+    if command.resume is not None:
+        given = dataclasses.replace(command, run=TrainConfig(), devices=1, tensorboard=False)
+        new = dataclasses.replace(TrainConfig().with_budget(config), data=config.data)
+        if given != Command(run=TrainConfig(), resume=command.resume) or config != new:
+            fail(
+                "--resume continues a run as it began: it takes a new budget (--steps, --episodes, "
+                "--minutes), the new place of its rooms (--data), --devices and --tensorboard alone"
+            )
+        from tdanet_jax.workflows.train import resumed
+
+        config = resumed(command.resume, config)
+    else:
+        config.check()
+        config = config.normalised()
+        if command.out is None and os.environ.get("JAX_COORDINATOR_ADDRESS"):
+            fail("a run of several processes needs --out: a folder that all of them see")
+    check_positive(devices=command.devices)
+    if command.tensorboard and importlib.util.find_spec("tensorboardX") is None:
+        fail("--tensorboard needs tensorboardX: pip install tensorboardX")
+    return config
+
+
+def default_folder(config: TrainConfig) -> Path:
+    """runs/18-4-tdanet-seed0-20260131-120000."""
+    return Path("runs") / f"{run_name(config)}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def run(command: Command, config: TrainConfig, folder: Path) -> None:
+    """Trains to the end of the budget, then evaluates and reports."""
+    with stoppable(lambda: how_to_continue(folder, config)) as reports:
+        from tdanet_jax.workflows.train import train
+
+        results = train(
+            config,
+            folder,
+            resume=command.resume is not None,
+            device_count=command.devices,
+            tensorboard=command.tensorboard,
+            callbacks=reports,
+        )
+        if results is not None and (setting := trust(config)):
+            console.print(f"custom code: to evaluate or load this run, export {setting}")
