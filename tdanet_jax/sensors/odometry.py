@@ -8,8 +8,6 @@ around the agent, rotated so that ahead is up.
 
 from __future__ import annotations
 
-import functools
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,37 +16,19 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from tdanet_jax.poses import ITHOR, STEPS, Integers, PoseGrid, modulo
-from tdanet_jax.sensors.sensor import MeasuredPose, Motion, Sensor, Start
+from tdanet_jax.poses import ITHOR, PoseGrid, modulo
+from tdanet_jax.sensors.sensor import Motion, Sensor, Start
+from tdanet_jax.sensors.shared import (
+    BLOCKED,
+    DIRECTIONS,
+    MAP_SIZE,
+    POSITION_SCALE,
+    WINDOW,
+    first_heading,
+    window_offsets,
+)
+from tdanet_jax.sensors.shared import measured_pose as measured_pose
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action
-
-#: Cells of the grid along each side of the map, which wraps around like a torus. The largest iTHOR
-#: room has 35.
-MAP_SIZE = 64
-#: Cells along each side of the part of the map that is read, the agent in its middle.
-WINDOW = 9
-#: A heading counts as that of the eight directions that is nearest to it.
-DIRECTIONS = len(STEPS)
-#: Bits of a cell: one for each direction in which the agent stood there, then "blocked".
-BLOCKED = 1 << DIRECTIONS
-#: Positions are divided by this many metres.
-POSITION_SCALE = 4.0
-
-
-@functools.cache
-def _window_offsets(rotations: int) -> np.ndarray:
-    """The cells of the window, [rotations, WINDOW, WINDOW, 2]: the first row is far ahead.
-
-    Off the axes these are the cells nearest to a square that is rotated: some cells occur twice,
-    and some not at all.
-    """
-    middle = WINDOW // 2
-    row, column = np.mgrid[:WINDOW, :WINDOW]
-    right, ahead = column - middle, middle - row
-    angle = np.arange(rotations)[:, None, None] * (2 * np.pi / rotations)
-    x = right * np.cos(angle) + ahead * np.sin(angle)
-    z = ahead * np.cos(angle) - right * np.sin(angle)
-    return np.rint(np.stack([x, z], axis=-1)).astype(np.int32)
 
 
 class Deviation(struct.PyTreeNode):
@@ -94,7 +74,7 @@ class Odometry(Sensor):
 
     def init(self, start: Start) -> OdometryState:
         """At the origin; of the rotation, only how it lies to the axes of the grid matters."""
-        heading = _first_heading(self.grid, start.rotation)
+        heading = first_heading(self.grid, start.rotation)
         cells = jnp.zeros((MAP_SIZE, MAP_SIZE), jnp.uint16)
         return OdometryState(
             cell=jnp.zeros(2, jnp.int32),
@@ -147,7 +127,7 @@ class Odometry(Sensor):
         right, ahead = x * cosine - z * sine, x * sine + z * cosine
         down = tilt(self.grid, state.horizon)
         motion = jnp.stack([right, ahead, sine, cosine, down, state.blocked])
-        offsets = _window_offsets(self.grid.rotations)
+        offsets = window_offsets(self.grid.rotations)
         around = (stands + jnp.asarray(offsets)[heading]) & (MAP_SIZE - 1)
         bits = state.cells[around[..., 0], around[..., 1]].astype(jnp.int32)
         stood = bits & (BLOCKED - 1)
@@ -168,29 +148,6 @@ class Odometry(Sensor):
 def make() -> Odometry:
     """The sensor."""
     return Odometry()
-
-
-def measured_pose(
-    grid: PoseGrid, rotation: int, ahead: float, right: float, turned: float
-) -> MeasuredPose:
-    """A pose that was measured relative to an episode's start, in the axes of odometry.
-
-    Args:
-      grid: the agent's.
-      rotation: at the start, in turns, as in `Start`.
-      ahead: metres from the start, in the direction in which the agent faced there.
-      right: metres to the right of it.
-      turned: degrees clockwise from that direction.
-    """
-    angle = math.radians(grid.turn * _first_heading(grid, rotation))
-    sine, cosine = math.sin(angle), math.cos(angle)
-    x, z = ahead * sine + right * cosine, ahead * cosine - right * sine
-    place = jnp.array([x / grid.grid_size, z / grid.grid_size], jnp.float32)
-    return MeasuredPose(place, jnp.float32(angle + math.radians(turned)))
-
-
-def _first_heading(grid: PoseGrid, rotation: Integers) -> Integers:
-    return modulo(rotation, math.lcm(grid.turn, 90) // grid.turn)
 
 
 def turn(

@@ -11,10 +11,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from tdanet_jax.sensors.shared import FOLLOWED
 from tdanet_jax.sensors.triangulation import TargetEstimate, Triangulation, direction_of, dot, solve
-
-#: The square of an error over that of what is left of it once the estimate has followed the ray.
-FOLLOWED = 2.0
 
 
 class RobustTriangulation(Triangulation):

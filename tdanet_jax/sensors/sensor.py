@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from tdanet_jax.poses import ITHOR, PoseGrid
+from tdanet_jax.sensors.shared import MeasuredPose as MeasuredPose
 
 
 class Slip(NamedTuple):
@@ -29,13 +30,6 @@ class Slip(NamedTuple):
 
 #: What the `slip` of a `Start` is where motion is measured, not believed.
 NO_SLIP = Slip(*np.array([1, 1, 0, 0], np.float32))
-
-
-class MeasuredPose(NamedTuple):
-    """Where an agent stands and faces, measured on a robot; see `odometry.measured_pose`."""
-
-    place: jax.Array  # [2] float32, x and z in cells, in the axes of `odometry.OdometryState`
-    angle: jax.Array  # float32, radians clockwise from z
 
 
 class Start(NamedTuple):

@@ -17,27 +17,20 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 
 from tdanet_jax.poses import PoseGrid
 from tdanet_jax.sensors import odometry
 from tdanet_jax.sensors.sensor import Frame, Motion, Sensor, Start
+from tdanet_jax.sensors.shared import (
+    BORDER,
+    HALF_CERTAIN,
+    MAX_RADIUS,
+    POSITION_SCALE,
+    PRIOR_WEIGHT,
+    SAME_OBJECT_COSINE,
+)
 from tdanet_jax.vocabulary import VISIBILITY_DISTANCE
-
-#: Weight of the prior, where a ray has weight 1.
-PRIOR_WEIGHT = 1e-3
-#: A box belongs to the tracked object if the position re-estimated with it lies within 12 degrees
-#: of the box's direction.
-SAME_OBJECT_COSINE = float(np.cos(np.radians(12)))
-#: Weight along the line of sight at which the certainty is one half.
-HALF_CERTAIN = 0.03
-#: Upper bound of a radius, in metres.
-MAX_RADIUS = 1.0
-#: Positions are divided by this many metres, and clipped at twice as many.
-POSITION_SCALE = 4.0
-#: Distances to the border of reach are divided by this many metres, and clipped there.
-BORDER = 0.25
 
 
 class TargetEstimate(struct.PyTreeNode):

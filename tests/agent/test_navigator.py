@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from tdanet_jax.agent.agent import Decision
+from tdanet_jax.agent.base import Decision
 from tdanet_jax.agent.camera import Camera
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
