@@ -95,7 +95,7 @@ class NumPyAgent(BaseAgent):
         weights: Mapping[str, np.ndarray],
         vectors: WordVectors,
         grid: PoseGrid = ITHOR,
-        synonyms: Synonyms | None = None,
+        synonyms: Synonyms | Path | str | None = None,
     ) -> None:
         super().__init__(meta.classes, vectors, dataclasses.replace(meta.spec, grid=grid), synonyms)
         self.meta = meta
