@@ -177,7 +177,8 @@ class Agent(BaseAgent):
         """
         count = len(states)
         told: Sequence[bool | None] = blocked or [None] * count
-        where: Sequence[MeasuredPose | None] = poses or [None] * count
+        nowhere: list[MeasuredPose | None] = [None] * count
+        where: Sequence[MeasuredPose | None] = poses or nowhere
         if {*map(len, (frames, targets, told, where, keys or states))} != {count}:
             raise ValueError(
                 f"{count} states: give as many frames, targets, keys, blocked and poses"

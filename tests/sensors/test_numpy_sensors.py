@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tdanet_jax.observation_spec import ObservationSpec
-from tdanet_jax.poses import ITHOR, PoseGrid
+from tdanet_jax.poses import PoseGrid
 from tdanet_jax.sensors import numpy_sensors, suite
 from tdanet_jax.sensors.sensor import NO_SLIP, Frame, Motion, Start
 from tdanet_jax.sensors.shared import measured_pose
@@ -89,4 +89,3 @@ def test_a_step_leaves_the_states_before_it_as_they_were():
     assert after["odometry"].cells[0, 1] == 1
     np.testing.assert_array_equal(states["odometry"].cells, cells)
     assert not states["triangulation"].normal.any()
-    assert ITHOR == BOTH.grid
