@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from tdanet_jax.task import make
     from tdanet_jax.training.callbacks import Callbacks
     from tdanet_jax.workflows.evaluate import evaluate
+    from tdanet_jax.workflows.export import export
     from tdanet_jax.workflows.train import train
 
 __version__ = "0.2.0"
@@ -43,6 +44,7 @@ _PUBLIC = {
     "NetworkConfig": "config",
     "TrainConfig": "config",
     "evaluate": "workflows.evaluate",
+    "export": "workflows.export",
     "load": "agent",
     "make": "task",
     "train": "workflows.train",
@@ -62,6 +64,7 @@ __all__ = [
     "TrainConfig",
     "__version__",
     "evaluate",
+    "export",
     "load",
     "make",
     "train",

@@ -9,7 +9,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tdanet_jax.agent.agent import Agent, AgentState, Decision, load
+    from tdanet_jax.agent.agent import Agent, AgentState, load
+    from tdanet_jax.agent.base import Decision
     from tdanet_jax.agent.camera import Camera
     from tdanet_jax.agent.detection import Detection
     from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
@@ -19,7 +20,7 @@ _MODULES = {
     "Agent": "agent",
     "AgentState": "agent",
     "Camera": "camera",
-    "Decision": "agent",
+    "Decision": "base",
     "Detection": "detection",
     "Navigator": "navigator",
     "NavigatorConfig": "navigator",

@@ -18,22 +18,23 @@ import numpy as np
 
 from tdanet_jax import config as configs
 from tdanet_jax import words
+from tdanet_jax.agent.base import BaseAgent, Decision
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors
 from tdanet_jax.env.types import Observation
 from tdanet_jax.io.bundled_agents import find_run, folder_of
-from tdanet_jax.labels import LabelError, Labels, Synonyms
+from tdanet_jax.labels import Synonyms
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
 from tdanet_jax.models.classes import ClassVocabulary, load_vocabulary
 from tdanet_jax.models.factory import make_model
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.sensors import suite
-from tdanet_jax.sensors.detections import centre_and_area, merge_classes
-from tdanet_jax.sensors.sensor import NO_SLIP, Frame, MeasuredPose, Motion, Start
+from tdanet_jax.sensors.sensor import NO_SLIP, Frame, Motion, Start
+from tdanet_jax.sensors.shared import MeasuredPose
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import newest
-from tdanet_jax.vocabulary import NUM_ACTIONS, Action, class_words
+from tdanet_jax.vocabulary import NUM_ACTIONS, Action
 from tdanet_jax.words import WordVectors
 
 #: Rows and labels are padded to multiples of these, so that few shapes are ever compiled.
@@ -49,16 +50,7 @@ class AgentState(NamedTuple):
     target: jax.Array  # int32, what it looked for in the previous step; -1 at the start
 
 
-class Decision(NamedTuple):
-    """What the agent does, and why."""
-
-    action: Action
-    probabilities: np.ndarray  # [6], in the order of `Action`; 0 for what is forbidden
-    value: float  # expected discounted return
-    attention: np.ndarray | None  # [n], weight of each detection; None if the model has none
-
-
-class Agent:
+class Agent(BaseAgent):
     """A trained network with its configuration and word vectors.
 
     Attributes:
@@ -80,16 +72,13 @@ class Agent:
         synonyms: Synonyms | Path | str | None = None,
     ) -> None:
         self.config = config
-        self.grid = grid
         self.classes = ClassVocabulary() if classes is None else classes
         self.model: ActorCritic = make_model(config, self.classes)
-        self.spec = dataclasses.replace(self.model.spec, grid=grid)
+        spec = dataclasses.replace(self.model.spec, grid=grid)
+        super().__init__(self.classes.names, vectors, spec, synonyms)
         self.weights = weights
-        self._vectors = vectors
-        self._synonyms = synonyms
-        self.labels = Labels(self.classes.names, vectors.index, synonyms)
-        self._rows = {class_words(name): i for i, name in enumerate(self.classes.names)}
         self._table: Any = None
+        self._table_rows = 0
         self._decide = jax.jit(self._forward)
         self._decide_many = jax.jit(jax.vmap(self._forward, (None, None, 0, 0, 0, 0)))
 
@@ -151,7 +140,7 @@ class Agent:
             told whether its MoveAhead was blocked; every action is forbidden; or a pose is given
             where none is expected, or missing.
         """
-        self._check(state, blocked, pose, forbidden)
+        self._checked(state, blocked, pose, forbidden)
         obs, owner = self._observe(detections, target)
         state, out, attention = self._decide(
             self.weights, self._prepared(), state, obs, jnp.asarray(bool(blocked)), pose
@@ -188,7 +177,8 @@ class Agent:
         """
         count = len(states)
         told: Sequence[bool | None] = blocked or [None] * count
-        where: Sequence[MeasuredPose | None] = poses or [None] * count
+        nowhere: list[MeasuredPose | None] = [None] * count
+        where: Sequence[MeasuredPose | None] = poses or nowhere
         if {*map(len, (frames, targets, told, where, keys or states))} != {count}:
             raise ValueError(
                 f"{count} states: give as many frames, targets, keys, blocked and poses"
@@ -196,7 +186,7 @@ class Agent:
         if len({pose is None for pose in where}) > 1:
             raise ValueError("poses: give one for each robot, or none")
         for one in zip(states, told, where, strict=True):
-            self._check(*one, forbidden)
+            self._checked(*one, forbidden)
         if not count:
             return []
         rows = max(map(len, frames))
@@ -217,7 +207,17 @@ class Agent:
             decided.append(_decision(own, values, attention, owner, key, forbidden))
         return decided
 
-    def _check(
+    def key(self, seed: int, step: int) -> jax.Array:
+        """The `key` with which `act` samples an action; another one for each seed and step."""
+        return jax.random.fold_in(jax.random.key(seed), step)
+
+    def add_words(self, more: Mapping[str, Sequence[float]] | Path | str) -> int:
+        """As `BaseAgent.add_words`."""
+        added = super().add_words(more)
+        self._table = None
+        return added
+
+    def _checked(
         self,
         state: AgentState,
         blocked: bool | None,
@@ -229,47 +229,9 @@ class Agent:
             raise ValueError(
                 f"{self.config.model} needs an image; an agent is shown detections alone"
             )
-        if self.spec.sensors and blocked is None and state.action == Action.MOVE_AHEAD:
-            raise ValueError("the agent has odometry: say whether its MoveAhead was `blocked`")
-        if len({*forbidden}) >= NUM_ACTIONS:
-            raise ValueError("every action is forbidden")
-        if "odometry" in state.sensors:
-            expected = state.sensors["odometry"].deviation is not None
-            if expected != (pose is not None):
-                raise ValueError(
-                    "a pose is measured in every step of an episode that begins with "
-                    "start(measured=True), and in no other"
-                )
-
-    def knows(self, label: str) -> bool:
-        """Whether a label has a meaning (`labels`), so that it can be detected or looked for."""
-        try:
-            self.labels.resolve(label)
-        except LabelError:
-            return False
-        return True
-
-    def add_words(self, more: Mapping[str, Sequence[float]] | Path | str) -> int:
-        """Gives the agent further words, for labels that it does not know.
-
-        Args:
-          more: word -> vector, or a file of vectors as GloVe's (`words.load_word_vectors`), of
-            which all words are taken. They must be vectors of the same model and length as those
-            with which the agent was trained (by default glove.6B.50d): others tell it nothing.
-
-        Returns:
-          The number of words that are new. Words that the agent has keep their vectors.
-
-        Raises:
-          ValueError: the file cannot be read, something is not a vector, or vectors are of another
-            length; the agent stays as it was.
-        """
-        source = "words" if isinstance(more, Mapping) else more
-        vectors = self._vectors.extended(words.read_words(more), source)
-        added = len(vectors.index) - len(self._vectors.index)
-        labels = Labels(self.classes.names, vectors.index, self._synonyms)
-        self._vectors, self.labels, self._table = vectors, labels, None
-        return added
+        odometry = state.sensors.get("odometry")
+        measured = odometry is not None and odometry.deviation is not None
+        self._check(int(state.action), measured, blocked, pose, forbidden)
 
     def _observe(
         self, detections: Sequence[Detection], target: str, least_rows: int = 0
@@ -279,17 +241,7 @@ class Agent:
         A row per detection; for a model made for it, a row per class. The rest, up to `least_rows`
         at least, is padding.
         """
-        labels = np.array([self._index(d.label) for d in detections], np.int32)
-        corners = np.array([(d.x1, d.y1, d.x2, d.y2) for d in detections]).reshape(-1, 4)
-        if self.spec.rows == "class":
-            labels, owner = np.unique(labels, return_inverse=True)
-            order = np.argsort(owner, kind="stable")
-            _, found = merge_classes(owner[order], corners[order])
-        else:
-            owner, found = np.arange(len(labels)), centre_and_area(corners)
-        if self.spec.scores:
-            scores = [1.0 if one.score is None else one.score for one in detections]
-            found = np.column_stack([found, scores])
+        labels, found, owner = self._shown(detections)
         count = len(labels)
         rows = max(-(-max(count, least_rows) // ROW_BLOCK), 1) * ROW_BLOCK
         classes = np.zeros((1, rows), np.int32)
@@ -304,16 +256,9 @@ class Agent:
         )
         return observation, owner
 
-    def _index(self, label: str) -> int:
-        """The row in the table of classes of what a label means; new words get a new row."""
-        key = class_words(self.labels.resolve(label))
-        if key not in self._rows:
-            self._rows[key] = len(self._rows)
-            self._table = None
-        return self._rows[key]
-
     def _prepared(self) -> Any:
-        if self._table is None:
+        if self._table is None or self._table_rows != len(self._rows):
+            self._table_rows = len(self._rows)
             names = [" ".join(key) for key in self._rows]
             table = self._vectors.table(names, self.config.network.word_norm)
             rest = -len(table) % LABEL_BLOCK

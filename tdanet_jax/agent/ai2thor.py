@@ -14,7 +14,8 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 
-from tdanet_jax.agent.agent import Agent, Decision
+from tdanet_jax.agent.agent import Agent
+from tdanet_jax.agent.base import Decision
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.labels import Labels
 from tdanet_jax.poses import ITHOR, PoseGrid

@@ -19,13 +19,12 @@ from tdanet_jax.agent import detectors
 from tdanet_jax.agent.camera import Camera, turned
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.labels import LabelError
+from tdanet_jax.sensors.shared import measured_pose
 from tdanet_jax.vocabulary import ACTION_NAMES, FIELD_OF_VIEW, Action
 
 if TYPE_CHECKING:
-    import jax
-
-    from tdanet_jax.agent.agent import Agent, AgentState, Decision
-    from tdanet_jax.sensors.sensor import MeasuredPose
+    from tdanet_jax.agent.base import BaseAgent, Decision
+    from tdanet_jax.sensors.shared import MeasuredPose
 
 #: x and y in metres and yaw in radians counterclockwise, as in ROS (REP 103), in any fixed frame.
 RobotPose = tuple[float, float, float]
@@ -84,7 +83,7 @@ class Navigator:
 
     def __init__(
         self,
-        agent: Agent,
+        agent: BaseAgent,
         camera: Camera | None = None,
         config: NavigatorConfig = NavigatorConfig(),
     ) -> None:
@@ -135,7 +134,7 @@ class Navigator:
         self.target, self.steps, self.outcome = target, 0, None
         self.seen, self.decision = [], None
         self._start, self._look, self._off = turn, look, down - nearest
-        self._state: AgentState | None = None
+        self._state: Any = None
         self._origin: RobotPose | None = None
         self._before: RobotPose | None = None
         self._kept: list[tuple[Detection, int]] = []  # in the image before the last action; age
@@ -201,15 +200,13 @@ class Navigator:
 
     def _measure(self, pose: RobotPose) -> MeasuredPose:
         """A robot's pose in the axes of the agent's odometry."""
-        from tdanet_jax.sensors import odometry
-
         if len(pose) != 3 or not all(map(math.isfinite, pose)):
             raise ValueError(f"pose {pose}: must be x, y and yaw, three finite numbers")
         x, y, yaw = self._origin or pose
         ahead = (pose[0] - x) * math.cos(yaw) + (pose[1] - y) * math.sin(yaw)
         left = (pose[1] - y) * math.cos(yaw) - (pose[0] - x) * math.sin(yaw)
         degrees = -math.degrees(pose[2] - yaw)
-        return odometry.measured_pose(self.agent.grid, self._start, ahead, -left, degrees)
+        return measured_pose(self.agent.grid, self._start, ahead, -left, degrees)
 
     def _motion(self, blocked: bool | None, pose: RobotPose | None) -> tuple[bool, float]:
         """Whether the last action moved the robot, and by how many degrees it turned it right."""
@@ -265,10 +262,6 @@ class Navigator:
                     out.append((now, age + 1))
         return out
 
-    def _key(self) -> jax.Array | None:
+    def _key(self) -> Any:
         """The key of the next action, if actions are sampled."""
-        if self.config.seed is None:
-            return None
-        import jax
-
-        return jax.random.fold_in(jax.random.key(self.config.seed), self._drawn)
+        return None if self.config.seed is None else self.agent.key(self.config.seed, self._drawn)

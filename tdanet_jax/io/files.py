@@ -11,8 +11,6 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 #: A process locks this file while it works in the folder.
 LOCK_FILE = ".lock"
 #: Prefix of what is being written; a process that is killed may leave it.
@@ -138,6 +136,8 @@ def locked(folder: Path, wait: bool = False) -> Iterator[None]:
       BlockingIOError: another process holds the lock, and `wait` is False.
       OSError: the folder cannot be written.
     """
+    from filelock import FileLock, Timeout  # a robot has it not
+
     created = [place for place in (folder, *folder.parents) if not place.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     if (folder / LOCK_FILE).is_symlink():

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tdanet_jax.poses import STEPS, Integers, PoseGrid, modulo
-
-if TYPE_CHECKING:
-    import jax
 
 # Odometry.
 
@@ -51,8 +48,8 @@ POSITION_SCALE = 4.0
 class MeasuredPose(NamedTuple):
     """Where an agent stands and faces, measured on a robot; see `measured_pose`."""
 
-    place: jax.Array | np.ndarray  # [2] float32, x and z in cells, in the axes of odometry
-    angle: jax.Array | np.ndarray  # float32, radians clockwise from z
+    place: Any  # [2] float32, of NumPy or JAX, x and z in cells, in the axes of odometry
+    angle: Any  # float32, radians clockwise from z
 
 
 def measured_pose(

@@ -14,7 +14,7 @@ import pytest
 import tdanet_jax
 from tdanet_jax import poses
 from tdanet_jax.agent import ai2thor
-from tdanet_jax.agent.agent import Decision
+from tdanet_jax.agent.base import Decision
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.analysis import trace
 from tdanet_jax.evaluation import episodes

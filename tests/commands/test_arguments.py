@@ -119,6 +119,13 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint bare --out full/file/below", "--out full/file/below: Not a directory"),
         ("--checkpoint nowhere --out new", "nowhere/config.json: no such file"),
     ],
+    "export": [
+        ("", "Missing from export: --checkpoint RUN"),
+        ("--checkpoint bare --out full", "--out full: exists and is not empty"),
+        ("--checkpoint bare --out new", "bare/checkpoints: no checkpoint"),
+        ("--checkpoint bare --out full/file/below", "--out full/file/below: Not a directory"),
+        ("--checkpoint nowhere --out new", "nowhere/config.json: no such file"),
+    ],
     "demo": [
         (
             "--scene FloorPlan31 --no-show",

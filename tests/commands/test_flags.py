@@ -236,6 +236,7 @@ PREPARE: dict[str, Callable[[Recorder], None]] = {
     "train_zero_shot": lambda r: r.record("tdanet_jax.workflows.train.train"),
     "evaluate": lambda r: r.record("tdanet_jax.workflows.evaluate.evaluate", gives=Ended),
     "share": lambda r: r.record("tdanet_jax.evaluation.saved_networks.share", gives=Ended),
+    "export": lambda r: r.record("tdanet_jax.workflows.export.export", gives=Ended),
     "demo": lambda r: r.record("tdanet_jax.commands.demo.show", "webbrowser.open", gives=None),
     "serve": prepare_serve,
     "replay": lambda r: agents(r, "tdanet_jax.io.files.write_text"),
@@ -292,6 +293,17 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
         },
     ),
     "share": (
+        "--out new",
+        {
+            "--checkpoint": ("--out new --checkpoint run", "--out new --checkpoint other"),
+            "--out": ("--checkpoint run --out new", "--checkpoint run --out more"),
+            "--word-vectors": (
+                "--checkpoint run --out new",
+                "--checkpoint run --out new --word-vectors words.txt",
+            ),
+        },
+    ),
+    "export": (
         "--out new",
         {
             "--checkpoint": ("--out new --checkpoint run", "--out new --checkpoint other"),

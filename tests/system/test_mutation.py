@@ -133,7 +133,7 @@ FAULTS = (
           "sensors/test_odometry.py"),
     Fault("the map ends", ODOMETRY, "[heading]) & (MAP_SIZE - 1)", "[heading])",
           "sensors/test_odometry.py"),
-    Fault("every start is along an axis", ODOMETRY, "modulo(rotation, math", "modulo(0 * rotation, math",
+    Fault("every start is along an axis", "sensors/shared.py", "modulo(rotation, math", "modulo(0 * rotation, math",
           "sensors/test_odometry.py"),
     Fault("the target moves along", TRIANGULATION, "moment - dot(state.normal, moved)",
           "moment + dot(state.normal, moved)", "sensors/test_triangulation.py"),

@@ -1,0 +1,309 @@
+"""An agent without JAX: NumPy alone, Python 3.10. `tdanet export` writes its folder.
+
+agent = load("exported")
+state = agent.start()
+state, decision = agent.act(state, [Detection("mug", 0.2, 0.3, 0.25, 0.4)], target="mug")
+
+It is used as an `agent.Agent`, by a `Navigator` too, and decides the same.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tdanet_jax import words
+from tdanet_jax.agent.base import BaseAgent, Decision
+from tdanet_jax.agent.detection import Detection
+from tdanet_jax.io.untrusted import FileError, npz
+from tdanet_jax.labels import Synonyms
+from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.poses import ITHOR, PoseGrid
+from tdanet_jax.sensors import numpy_sensors
+from tdanet_jax.sensors.shared import MeasuredPose
+from tdanet_jax.vocabulary import NUM_ACTIONS, Action
+from tdanet_jax.words import WordVectors
+
+#: Files of an exported agent: what it is shown, its parameters, and its words.
+META_FILE, MODEL_FILE, WORDS_FILE = "meta.json", "model.npz", "words.npz"
+#: Version of the files' layout; `load` refuses another one.
+FORMAT = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Meta:
+    """What `meta.json` says."""
+
+    classes: tuple[str, ...]  # class names, in the order of the run's vocabulary
+    rows: str  # as in ObservationSpec
+    sensors: tuple[str, ...]
+    scores: bool
+    word_norm: float  # length to which the vectors of names are scaled
+    width: int  # units of each layer of the encoder
+    hidden: int  # units of the LSTM
+    action_units: int  # that embed the previous step's action probabilities
+    sensor_units: int  # that embed what the sensors say; 0 without sensors
+    target_box: tuple[float, ...]  # [F], of the target's row, before its word vector
+
+    @property
+    def spec(self) -> ObservationSpec:
+        """What the agent is shown."""
+        rows: Any = self.rows
+        return ObservationSpec(rows=rows, sensors=self.sensors, scores=self.scores)
+
+
+#: The fields of `meta.json` and their types in JSON.
+_KINDS: dict[str, type] = {
+    "classes": list, "rows": str, "sensors": list, "scores": bool, "word_norm": float,
+    "width": int, "hidden": int, "action_units": int, "sensor_units": int, "target_box": list,
+}  # fmt: skip
+
+
+class AgentState(NamedTuple):
+    """What the agent carries from step to step of one episode."""
+
+    hidden: np.ndarray  # [H] float32, of the LSTM
+    cell: np.ndarray  # [H] float32
+    probabilities: np.ndarray  # [6] float32, of the previous step's actions; 0 at the start
+    action: int  # the previous action; 6 at the start
+    sensors: numpy_sensors.States  # before that action
+    target: int  # row of what it looked for in the previous step; -1 at the start
+
+
+class Target(NamedTuple):
+    """What the network computes from the target's name alone."""
+
+    query: np.ndarray  # [F + D] float32, whose product with a row is its attention logit
+    reference: np.ndarray  # [width] float32, the target's branch of the Siamese comparison
+
+
+class NumPyAgent(BaseAgent):
+    """A trained TDANet.
+
+    Attributes:
+      weights: parameters by name, "encoder/linear1/kernel".
+    """
+
+    def __init__(
+        self,
+        meta: Meta,
+        weights: Mapping[str, np.ndarray],
+        vectors: WordVectors,
+        grid: PoseGrid = ITHOR,
+        synonyms: Synonyms | Path | str | None = None,
+    ) -> None:
+        super().__init__(meta.classes, vectors, dataclasses.replace(meta.spec, grid=grid), synonyms)
+        self.meta = meta
+        self.weights = weights
+        self._embedded: dict[int, np.ndarray] = {}  # row of a name -> its vector
+        self._targets: dict[int, Target] = {}
+
+    def start(self, rotation: float = 0, horizon: float = 0, measured: bool = False) -> AgentState:
+        """The state at the start of an episode; arguments and errors as of `agent.Agent.start`."""
+        turn, down = self.grid.nearest_view(rotation, horizon)
+        zeros = np.zeros(self.meta.hidden, np.float32)
+        return AgentState(
+            hidden=zeros,
+            cell=zeros,
+            probabilities=np.zeros(NUM_ACTIONS, np.float32),
+            action=NUM_ACTIONS,
+            sensors=numpy_sensors.init(self.spec, turn, down, measured),
+            target=-1,
+        )
+
+    def act(
+        self,
+        state: AgentState,
+        detections: Sequence[Detection],
+        target: str,
+        key: np.random.Generator | None = None,
+        blocked: bool | None = None,
+        *,
+        forbidden: Collection[Action] = (),
+        pose: MeasuredPose | None = None,
+    ) -> tuple[AgentState, Decision]:
+        """One step; arguments and errors as of `agent.Agent.act`, but `key` is a generator."""
+        odometry = state.sensors.get("odometry")
+        measured = odometry is not None and odometry.measured
+        self._check(state.action, measured, blocked, pose, forbidden)
+        goal = self._index(target)
+        labels, found, owner = self._shown(detections)
+        found = found.astype(np.float32)
+        sensors = numpy_sensors.after(
+            self.spec, state.sensors, state.action, bool(blocked), pose,
+            another_target=goal != state.target, boxes=found[labels == goal],
+        )  # fmt: skip
+        attention, features = self._encode(goal, labels, found)
+        if self.spec.sensors:
+            sensed = self._layer("way", numpy_sensors.features(self.spec, sensors))
+            features = np.concatenate([features, _relu(sensed)])
+        action_features = _relu(self._layer("action_embedding", state.probabilities))
+        hidden, cell = self._lstm(features, action_features, state.hidden, state.cell)
+        logits = self._layer("actor", hidden)
+        probabilities = shown = _softmax(logits)
+        if forbidden:
+            logits = logits.copy()
+            logits[[*forbidden]] = -np.inf
+            shown = _softmax(logits)
+        action = int(np.argmax(logits))
+        if key is not None:
+            action = int(key.choice(NUM_ACTIONS, p=shown / shown.sum(dtype=float)))
+        value = float(self._layer("critic", hidden)[0])
+        after = AgentState(hidden, cell, probabilities, action, sensors, goal)
+        return after, Decision(Action(action), shown, value, attention[owner])
+
+    def key(self, seed: int, step: int) -> np.random.Generator:
+        """The `key` with which `act` samples an action; another one for each seed and step."""
+        return np.random.default_rng([seed, step])
+
+    def add_words(self, more: Mapping[str, Sequence[float]] | Path | str) -> int:
+        """As `BaseAgent.add_words`."""
+        added = super().add_words(more)
+        self._embedded, self._targets = {}, {}
+        return added
+
+    def _word(self, row: int) -> np.ndarray:
+        """The vector [D] of the name in a row of the table of classes."""
+        if row not in self._embedded:
+            name = " ".join([*self._rows][row])
+            self._embedded[row] = self._vectors.embed(name, self.meta.word_norm)
+        return self._embedded[row]
+
+    def _target(self, row: int) -> Target:
+        if row not in self._targets:
+            box = np.array(self.meta.target_box, np.float32)
+            inputs = np.concatenate([box, self._word(row)])
+            # The bias adds the same to the logits of all rows.
+            query = self.weights["encoder/attention/kernel"] @ self._layer(
+                "encoder/attention", inputs
+            )
+            self._targets[row] = Target(query, self._branch(inputs))
+        return self._targets[row]
+
+    def _encode(
+        self, goal: int, labels: np.ndarray, boxes: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The encoder of `models.tdanet`: attention [n] over the rows, and features [width]."""
+        target = self._target(goal)
+        inputs = np.zeros((len(labels), len(target.query)), np.float32)  # [n, F + D]
+        for row, label, box in zip(inputs, labels.tolist(), boxes, strict=True):
+            row[: len(box)], row[len(box) :] = box, self._word(label)
+        attention = _softmax(inputs @ target.query) if len(inputs) else np.zeros(0, np.float32)
+        difference = np.abs(self._branch(attention @ inputs) - target.reference)
+        third = _relu(self._layer("encoder/linear3", difference))
+        return attention, _relu(self._layer("encoder/linear4", third))
+
+    def _branch(self, inputs: np.ndarray) -> np.ndarray:
+        first = _relu(self._layer("encoder/linear1", inputs))
+        return _relu(self._layer("encoder/linear2", first))
+
+    def _lstm(
+        self, inputs: np.ndarray, skip: np.ndarray, hidden: np.ndarray, cell: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Hidden state and cell after a step."""
+        gates = np.concatenate([inputs, hidden]) @ self.weights["lstm/kernel"]
+        gates = gates + skip @ self.weights["lstm/kernel_skip"]
+        gates = gates + self.weights["lstm/bias_ih"] + self.weights["lstm/bias_hh"]
+        i, f, g, o = np.split(gates, 4)
+        cell = _sigmoid(f) * cell + _sigmoid(i) * np.tanh(g)
+        return _sigmoid(o) * np.tanh(cell), cell
+
+    def _layer(self, name: str, inputs: np.ndarray) -> np.ndarray:
+        return inputs @ self.weights[f"{name}/kernel"] + self.weights[f"{name}/bias"]
+
+
+def load(
+    folder: Path | str, grid: PoseGrid = ITHOR, synonyms: Synonyms | Path | str | None = None
+) -> NumPyAgent:
+    """An exported agent.
+
+    Args:
+      folder: that `tdanet export` wrote.
+      grid: the turns and steps of the world in which the agent acts, if it has sensors.
+      synonyms: other names of things, {"Mug": ["beaker"]}, or a JSON file of them.
+
+    Raises:
+      ValueError: a file is missing, damaged or does not fit the others; the message names it.
+    """
+    folder = Path(folder)
+    meta = _read_meta(folder / META_FILE)
+    vectors = words.load_word_vectors(folder / WORDS_FILE)
+    weights = npz.read(folder / MODEL_FILE)
+    expected = shapes(meta, vectors.vectors.shape[1])
+    for name in sorted({*weights, *expected}):
+        shape = weights[name].shape if name in weights else "missing"
+        if shape != expected.get(name) or weights[name].dtype != np.float32:
+            wanted = f"float32 {expected[name]}" if name in expected else "a parameter"
+            raise FileError(folder / MODEL_FILE, f"{name} is {shape}, not {wanted}")
+    if isinstance(synonyms, str | Path):
+        synonyms = _read_json(Path(synonyms))
+    return NumPyAgent(meta, weights, vectors, grid, synonyms)
+
+
+def shapes(meta: Meta, word: int) -> dict[str, tuple[int, ...]]:
+    """The parameters by name, for word vectors of this length."""
+    spec, gates = meta.spec, 4 * meta.hidden
+    layers = {
+        "encoder/attention": (spec.columns + word, meta.width),
+        "encoder/linear1": (spec.columns + word, meta.width),
+        **{f"encoder/linear{n}": (meta.width, meta.width) for n in (2, 3, 4)},
+        "action_embedding": (NUM_ACTIONS, meta.action_units),
+        "actor": (meta.hidden, NUM_ACTIONS),
+        "critic": (meta.hidden, 1),
+    }
+    if spec.sensors:
+        width = sum(numpy_sensors.WIDTHS[name] for name in spec.sensors)
+        layers["way"] = width, meta.sensor_units
+    kernels = {f"{name}/kernel": shape for name, shape in layers.items()}
+    biases = {f"{name}/bias": shape[1:] for name, shape in layers.items()}
+    return {
+        **kernels,
+        **biases,
+        "lstm/kernel": (meta.width + meta.sensor_units + meta.hidden, gates),
+        "lstm/kernel_skip": (meta.action_units, gates),
+        "lstm/bias_ih": (gates,),
+        "lstm/bias_hh": (gates,),
+    }
+
+
+def _read_meta(path: Path) -> Meta:
+    values = _read_json(path)
+    if not isinstance(values, dict) or values.get("format") != FORMAT:
+        raise FileError(path, f"not an agent in the format that this version reads, {FORMAT}")
+    for name, kind in _KINDS.items():
+        if type(values.get(name)) is not kind:
+            raise FileError(path, f"{name} is missing, or not of type {kind.__name__}")
+    for name in (*values["classes"], *values["sensors"]):
+        if not isinstance(name, str):
+            raise FileError(path, f"{name} is not a name")
+    if unknown := {*values["sensors"]} - {*numpy_sensors.WIDTHS}:
+        raise FileError(path, f"no sensor is called {min(unknown)}")
+    lists = {name: tuple(values[name]) for name, kind in _KINDS.items() if kind is list}
+    return Meta(**{name: values[name] for name in _KINDS} | lists)
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileError(path, error.strerror) from None
+    except ValueError as error:
+        raise FileError(path, f"not JSON ({error})") from None
+
+
+def _relu(x: np.ndarray) -> np.ndarray:
+    return np.maximum(x, 0)
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return (1 + np.tanh(x / 2)) / 2  # for large x of either sign, too
+
+
+def _softmax(x: np.ndarray) -> np.ndarray:
+    exponentials = np.exp(x - x.max())
+    return exponentials / exponentials.sum()
