@@ -1,30 +1,38 @@
 """Recurrent PPO in the manner of PureJaxRL, for any environment with gymnax 1.0's methods.
 
-Nothing in `make_train` knows this environment. `python examples/recurrent_ppo.py` trains it in the
+Nothing in `make_train` knows this environment. `python examples/recurrent_ppo.py` trains in the
 rooms of split 18/4, and plays the test episodes.
 """
 
 from __future__ import annotations
 
-import sys
+import time
 from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
+import tyro
 
 import tdanet_jax
+from tdanet_jax import TrainConfig
 from tdanet_jax.env.environment import FlatObservations
 from tdanet_jax.evaluation import policies
 
 
 class Config(NamedTuple):
-    """What PureJaxRL's scripts have in a dictionary."""
+    """Trains in the rooms of a split, and plays its test episodes."""
 
+    split: str = "18/4"
+    """seen and unseen target classes"""
+    validation: bool = False
+    """train without the validation rooms and classes, and play the validation episodes"""
+    seed: int = 0
+    """of parameters, episodes and actions"""
     num_envs: int = 64
     num_steps: int = 32
-    total_steps: int = 2_000_000
+    total_timesteps: int = 2_000_000
     minibatches: int = 4
     epochs: int = 2
     learning_rate: float = 5e-4
@@ -39,7 +47,7 @@ class Config(NamedTuple):
     @property
     def updates(self) -> int:
         """Rollouts in all."""
-        return self.total_steps // (self.num_envs * self.num_steps)
+        return self.total_timesteps // (self.num_envs * self.num_steps)
 
 
 class Network(nn.Module):
@@ -155,8 +163,8 @@ def make_train(config: Config, env: Any, params: Any) -> Any:
     return train
 
 
-def policy(config: Config, env: FlatObservations, weights: Any) -> policies.Policy:
-    """The trained network, as the evaluation takes one."""
+def score(config: Config, env: FlatObservations, weights: Any) -> dict[str, Any]:
+    """The results of a trained network on the fixed test episodes; its actions are sampled."""
     network = Network(env.num_actions, config.hidden)
 
     def start(batch: int) -> tuple[jax.Array, jax.Array]:
@@ -167,23 +175,29 @@ def policy(config: Config, env: FlatObservations, weights: Any) -> policies.Poli
         carry, logits, _ = network.apply(weights, carry, obs, begun)
         return (carry, jnp.zeros_like(begun)), jax.random.categorical(key, logits)
 
-    return policies.on_vectors(env, start, act)
+    return tdanet_jax.evaluate(policy=policies.on_vectors(start, act), config=task(config))
 
 
-def main(total_steps: int = Config().total_steps) -> dict[str, Any]:
-    """Trains, and plays the test episodes: their results."""
-    config = Config(total_steps=total_steps)
-    env, params = tdanet_jax.make("ithor-18/4")
-    train = jax.jit(make_train(config, FlatObservations(env), params))
-    weights, success = train(jax.random.key(0))
+def task(config: Config) -> TrainConfig:
+    """The rooms and classes."""
+    return TrainConfig(split=config.split, validation=config.validation)
+
+
+def main(config: Config) -> None:
+    """Trains, and plays the test episodes."""
+    env, params = tdanet_jax.make(f"ithor-{config.split}", config=task(config))
+    flat = FlatObservations(env)
+    key = jax.random.key(config.seed)
+    train = jax.jit(make_train(config, flat, params)).lower(key).compile()
+    began = time.time()
+    weights, success = jax.block_until_ready(train(key))
+    print(f"{config.total_timesteps / (time.time() - began):,.0f} steps per second")
     print(f"success in the last tenth of training: {success[-len(success) // 10 :].mean():.1%}")
-    test = FlatObservations(tdanet_jax.make("ithor-18/4", "test")[0])
-    results = tdanet_jax.evaluate(policy=policy(config, test, weights))
+    results = score(config, flat, weights)
     for group in ("seen", "unseen"):
         row = results[group]["L>=1"]
         print(f"{group}: SR {row['SR']:.1f}  SPL {row['SPL']:.1f}")
-    return results
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main(tyro.cli(Config))

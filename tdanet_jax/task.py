@@ -124,12 +124,19 @@ def make(
     config = dataclasses.replace(config or TrainConfig(), split=name.removeprefix(ITHOR))
     config.check()
     task = load_task(config if split == "train" else config.in_rooms_alone())
-    # As many rows in training as in tests, so that networks of others can go from one to the other.
+    env = environment(task, name, split)
+    return env, env.default_params
+
+
+def environment(task: Task, name: str, split: Literal["train", "test"]) -> Environment:
+    """The environment of a task's training or test rooms, under this name.
+
+    Both have as many rows, so that networks of others can go from one to the other.
+    """
     rows = max(task.train_params.max_detections, task.eval_params.max_detections)
     params = task.train_params if split == "train" else task.eval_params
-    params = params.with_rows(rows)
     words = task.train_words if split == "train" else task.words
-    return Environment(name, params, task.tables.classes, words), params
+    return Environment(name, params.with_rows(rows), task.tables.classes, words)
 
 
 def load_task(config: TrainConfig, progress: Progress | None = None) -> Task:

@@ -129,7 +129,7 @@ class NavigationEnv(gymnasium.Env):
         super().reset(seed=seed, options=options)
         key = jax.random.key(int(self.np_random.integers(2**31)))
         obs, self._state = self._shown.reset(key, self._shown.params)
-        return self._on_host(obs), self._about(self._state)
+        return self._shown_to_user(obs), self._about(self._state)
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One action; `info` holds the target's name, `success`, `length` and `shortest`."""
@@ -141,17 +141,17 @@ class NavigationEnv(gymnasium.Env):
         self._state = out.state
         info = self._about(out.state) | {"success": bool(out.success)}
         return (
-            self._on_host(obs),
+            self._shown_to_user(obs),
             float(out.reward),
             bool(out.terminated),
             bool(out.truncated),
             info,
         )
 
-    def _on_host(self, obs: Any) -> Any:
+    def _shown_to_user(self, obs: Any) -> Any:
         if isinstance(obs, dict):  # Gymnasium wants a number, not an array
-            return jax.device_get(obs) | {"target": int(obs["target"])}
-        return np.asarray(obs)
+            return _on_host(obs) | {"target": int(obs["target"])}
+        return _on_host(obs)
 
     def _about(self, state: EnvState) -> dict[str, Any]:
         params = self._shown.params
@@ -199,7 +199,7 @@ class NavigationVectorEnv(VectorEnv):
         """Starts `num_envs` random episodes: (observations, info)."""
         super().reset(seed=seed, options=options)
         obs, self._state = self._shown.reset_many(self._keys(), self._shown.params)
-        return jax.device_get(obs), {}
+        return _on_host(obs), {}
 
     def step(
         self, actions: np.ndarray
@@ -212,7 +212,7 @@ class NavigationVectorEnv(VectorEnv):
         taken = jnp.asarray(actions, jnp.int32)
         step = self._shown.step_many
         self._state, told = step(self._keys(), self._state, taken, self._shown.params)
-        obs, (reward, terminated, truncated), final, about = jax.device_get(told)
+        obs, (reward, terminated, truncated), final, about = _on_host(told)
         done = terminated | truncated
         info = {
             **about,
@@ -226,6 +226,11 @@ class NavigationVectorEnv(VectorEnv):
     def _keys(self) -> jax.Array:
         key = jax.random.key(int(self.np_random.integers(2**31)))
         return jax.random.split(key, self.num_envs)
+
+
+def _on_host(arrays: Any) -> Any:
+    """The same in NumPy arrays that may be written to, as PyTorch and many wrappers expect."""
+    return jax.tree.map(np.array, arrays)
 
 
 def _check(action: int) -> None:

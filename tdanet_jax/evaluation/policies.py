@@ -11,7 +11,7 @@ import numpy as np
 from jax.experimental import io_callback
 
 from tdanet_jax.env import dynamics
-from tdanet_jax.env.environment import FlatObservations
+from tdanet_jax.env.environment import Environment, FlatObservations
 from tdanet_jax.env.types import EnvParams, EnvState
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
@@ -107,36 +107,39 @@ def put(tree: Any, rows: jax.Array | None, new: Any) -> Any:
     return jax.tree.map(lambda x, y: x.at[rows].set(y, mode="drop"), tree, new)
 
 
+#: A policy that has to know the environment that it is evaluated in.
+MakePolicy = Callable[[Environment], Policy]
+
+
 def on_vectors(
-    env: FlatObservations,
     start: Callable[[int], Any],
     act: Callable[[Any, jax.Array, jax.Array], tuple[Any, jax.Array]],
-) -> Policy:
+) -> MakePolicy:
     """A policy in JAX that sees vectors, such as one that was trained on `FlatObservations`.
 
     Args:
-      env: the vectors of the test rooms: `FlatObservations(tdanet_jax.make(name, "test")[0])`.
       start: `start(batch)` gives the memory at the start of the episodes.
       act: `act(memory, key, vectors [B, size])` gives the memory and the actions [B].
     """
 
-    def batched(
-        weights: Any, memory: Any, key: jax.Array, state: EnvState, params: EnvParams
-    ) -> tuple[Any, jax.Array]:
-        return act(memory, key, _vectors(env, state, params))
+    def make(env: Environment) -> Policy:
+        def batched(
+            weights: Any, memory: Any, key: jax.Array, state: EnvState, params: EnvParams
+        ) -> tuple[Any, jax.Array]:
+            return act(memory, key, _vectors(env, state, params))
 
-    return Policy(lambda weights, batch: start(batch), batched)
+        return Policy(lambda weights, batch: start(batch), batched)
+
+    return make
 
 
 def on_host(
-    env: FlatObservations,
     predict: Callable[[np.ndarray], np.ndarray],
     start: Callable[[int], None] = lambda batch: None,
-) -> Policy:
+) -> MakePolicy:
     """A policy outside of JAX, such as one of Stable-Baselines3 that was trained on vectors.
 
     Args:
-      env: the vectors of the test rooms, as in `on_vectors`.
       predict: actions [B] for vectors [B, size], called once a step, in order; what it remembers
         of earlier steps is its own affair.
       start: called with the number of episodes when they begin.
@@ -149,17 +152,22 @@ def on_host(
     def asked(vectors: jax.Array) -> np.ndarray:
         return np.asarray(predict(np.asarray(vectors)), np.int32)
 
-    def act(
-        weights: Any, memory: Any, key: jax.Array, state: EnvState, params: EnvParams
-    ) -> tuple[Any, jax.Array]:
-        actions = jax.ShapeDtypeStruct(state.pose.shape, jnp.int32)
-        return memory, io_callback(asked, actions, _vectors(env, state, params), ordered=True)
+    def make(env: Environment) -> Policy:
+        def act(
+            weights: Any, memory: Any, key: jax.Array, state: EnvState, params: EnvParams
+        ) -> tuple[Any, jax.Array]:
+            actions = jax.ShapeDtypeStruct(state.pose.shape, jnp.int32)
+            return memory, io_callback(asked, actions, _vectors(env, state, params), ordered=True)
 
-    return Policy(begin, act)
+        return Policy(begin, act)
+
+    return make
 
 
-def _vectors(env: FlatObservations, state: EnvState, params: EnvParams) -> jax.Array:
+def _vectors(env: Environment, state: EnvState, params: EnvParams) -> jax.Array:
+    flat = FlatObservations(env)
+
     def one(state: EnvState) -> jax.Array:
-        return env.flatten(dynamics.observe(state, params), params)
+        return flat.flatten(dynamics.observe(state, params), params)
 
     return jax.vmap(one)(state)

@@ -11,10 +11,10 @@ from typing import Any
 from tdanet_jax.analysis import figures
 from tdanet_jax.config import OWN_TASK, EvalConfig, TrainConfig
 from tdanet_jax.evaluation import comparison, policies, report, rollout, saved_networks, selection
-from tdanet_jax.evaluation.policies import Policy
+from tdanet_jax.evaluation.policies import MakePolicy, Policy
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
 from tdanet_jax.io import files
-from tdanet_jax.task import load_task
+from tdanet_jax.task import ITHOR, environment, load_task
 
 #: Policies that need no checkpoint.
 UNTRAINED: dict[str, Callable[[], Policy]] = {
@@ -25,7 +25,7 @@ UNTRAINED: dict[str, Callable[[], Policy]] = {
 
 def evaluate(
     checkpoint: Path | str | Sequence[Path | str] | None = None,
-    policy: str | Policy = "sample",
+    policy: str | Policy | MakePolicy = "sample",
     *,
     config: TrainConfig | None = None,
     history: bool = False,
@@ -41,7 +41,8 @@ def evaluate(
       checkpoint: folder of a run, or several, which are played in one compiled call; None for
         policies that need none.
       policy: "sample" or "greedy", how a network's actions are chosen; "random" or
-        "shortest_path"; or a custom `Policy`.
+        "shortest_path"; or a custom `Policy`, such as `policies.on_host` makes of a network that
+        was trained elsewhere.
       config: rooms, classes and words for policies without a checkpoint; by default split 18/4.
       history: evaluate the whole history of each run instead of its newest checkpoint.
       data: file of rooms to evaluate in, instead of the run's; short for `test.data`.
@@ -99,7 +100,7 @@ def evaluate(
 
 
 def _evaluate_policy(
-    policy: str | Policy,
+    policy: str | Policy | MakePolicy,
     config: TrainConfig,
     test: EvalConfig,
     seed: int | None,
@@ -118,6 +119,10 @@ def _evaluate_policy(
     task, seed = load_task(config), config.seed if seed is None else seed
     params, lists = selection.select(task, test)
     params = selection.with_senses(task, params, [test.senses])[0]
+    if callable(policy):
+        env = environment(task, f"{ITHOR}{config.split}", "test")
+        params = params.with_rows(env.default_params.max_detections)
+        policy = policy(env)
     played = rollout.evaluate_lists(policy, None, params, lists, seed)
     provenance = report.Provenance.of(task, config, name, seed, departures=test.departures)
     return report.results(provenance, task.tables, played, folder)

@@ -16,8 +16,11 @@ from tdanet_jax import __main__ as tdanet
 from tdanet_jax.commands import scenes
 from tests.support.pages import PAGES, ROOT, prose
 
-#: Flags of other programs that the pages mention.
-FOREIGN = {"--check", "--durations", "--fix", "--help", "--xla_gpu_deterministic_ops"}
+#: Flags of other programs, and of the examples, that the pages mention.
+FOREIGN = {
+    "--check", "--durations", "--fix", "--help", "--total-timesteps",
+    "--xla_cpu_multi_thread_eigen", "--xla_gpu_deterministic_ops",
+}  # fmt: skip
 #: Where the files are that a page may name.
 FOLDERS = (
     "tests/", "tdanet_jax/", "experiments/", "docs/", "assets/", "agents/18", "notebooks/", ".ci/"
