@@ -22,6 +22,7 @@ COMMANDS = {
     "attention": ("attention", "shows what an agent attends to"),
     "scenes": ("scenes", "builds, imports, exports, varies, checks and draws rooms"),
     "serve": ("serve", "answers a robot's frames with actions, in lines of JSON"),
+    "noise": ("noise", "measures the noise of a detector on labelled images"),
     "share": ("share", "makes a small folder of a trained agent"),
     "benchmark": ("benchmark", "measures speed"),
     "scaling": ("scaling", "measures how cost grows with rooms and detections"),

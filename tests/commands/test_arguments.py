@@ -119,6 +119,10 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint bare --out full/file/below", "--out full/file/below: Not a directory"),
         ("--checkpoint nowhere --out new", "nowhere/config.json: no such file"),
     ],
+    "noise": [
+        ("--truth nowhere.json --found x", "nowhere.json: no such file"),
+        ("--truth full/file --found x", "full/file: not JSON"),
+    ],
     "demo": [
         (
             "--scene FloorPlan31 --no-show",
