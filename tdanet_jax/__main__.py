@@ -23,6 +23,7 @@ COMMANDS = {
     "scenes": ("scenes", "builds, imports, exports, varies, checks and draws rooms"),
     "serve": ("serve", "answers a robot's frames with actions, in lines of JSON"),
     "export": ("export", "makes a folder of an agent for robots without JAX"),
+    "noise": ("noise", "measures the noise of a detector on labelled images"),
     "share": ("share", "makes a small folder of a trained agent"),
     "benchmark": ("benchmark", "measures speed"),
     "scaling": ("scaling", "measures how cost grows with rooms and detections"),

@@ -23,6 +23,15 @@ _MOST: Mapping[str, float] = {
 }
 
 
+#: Side of a box, as a share of the image's, at which misses of small boxes have fallen to 1/e.
+SMALL_SIDE = 0.1
+
+
+def highest(name: str) -> float:
+    """The upper bound of the level with this name."""
+    return _MOST.get(name, 1)
+
+
 @dataclasses.dataclass(frozen=True)
 class SenseNoise:
     """Levels of noise; 0 is a perfect sense. Rates are probabilities.
@@ -79,7 +88,7 @@ class SenseNoise:
         """Raises ValueError, with one line that names the flag and field, if a level is wrong."""
         for field in dataclasses.fields(self):
             low, high = ends(getattr(self, field.name))
-            most = _MOST.get(field.name, 1)
+            most = highest(field.name)
             if not 0 <= low <= high <= most:
                 raise ValueError(
                     f"{flag} {field.name}: must be a level from 0 to {most}, or a range of them"
@@ -127,8 +136,7 @@ SWEEP_FILE = "noise.json"
 def scaled(noise: SenseNoise, factor: float) -> SenseNoise:
     """Noise with every level times a factor, as far as levels go."""
     values = {
-        n: min(round(factor * ends(level)[1], 9), _MOST.get(n, 1))
-        for n, level in vars(noise).items()
+        n: min(round(factor * ends(level)[1], 9), highest(n)) for n, level in vars(noise).items()
     }
     return SenseNoise(**values)
 

@@ -17,13 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from tdanet_jax.sense_noise import SenseNoise, ends
+from tdanet_jax.sense_noise import SMALL_SIDE, SenseNoise, ends
 from tdanet_jax.sensors.sensor import Slip
 
 #: Rows after those in view that false positives and duplicates can fill.
 EXTRA = 4
-#: Side of a box, as a share of the image's, at which misses of small boxes have fallen to 1/e.
-SMALL_SIDE = 0.1
 #: Classes that a class can be confused with.
 SIMILAR = 4
 #: Classes that look alike, or that detectors often take for each other; the nearest word vectors

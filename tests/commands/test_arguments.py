@@ -120,11 +120,15 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint nowhere --out new", "nowhere/config.json: no such file"),
     ],
     "export": [
-        ("", "Missing from export: --checkpoint RUN"),
+        ("", "Missing from tdanet export: --checkpoint RUN"),
         ("--checkpoint bare --out full", "--out full: exists and is not empty"),
         ("--checkpoint bare --out new", "bare/checkpoints: no checkpoint"),
         ("--checkpoint bare --out full/file/below", "--out full/file/below: Not a directory"),
         ("--checkpoint nowhere --out new", "nowhere/config.json: no such file"),
+    ],
+    "noise": [
+        ("--truth nowhere.json --found x", "nowhere.json: no such file"),
+        ("--truth full/file --found x", "full/file: not JSON"),
     ],
     "demo": [
         (

@@ -231,12 +231,18 @@ def prepare_serve(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.commands.serve.read_lines", gives=Ended)
 
 
+def prepare_noise(recorder: Recorder) -> None:
+    recorder.record("tdanet_jax.agent.measured_noise.read_coco", gives=((), ()))
+    recorder.record("tdanet_jax.agent.measured_noise.measure", gives=Ended)
+
+
 #: Command -> how its functions are recorded.
 PREPARE: dict[str, Callable[[Recorder], None]] = {
     "train_zero_shot": lambda r: r.record("tdanet_jax.workflows.train.train"),
     "evaluate": lambda r: r.record("tdanet_jax.workflows.evaluate.evaluate", gives=Ended),
     "share": lambda r: r.record("tdanet_jax.evaluation.saved_networks.share", gives=Ended),
     "export": lambda r: r.record("tdanet_jax.workflows.export.export", gives=Ended),
+    "noise": prepare_noise,
     "demo": lambda r: r.record("tdanet_jax.commands.demo.show", "webbrowser.open", gives=None),
     "serve": prepare_serve,
     "replay": lambda r: agents(r, "tdanet_jax.io.files.write_text"),
@@ -312,6 +318,15 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
                 "--checkpoint run --out new",
                 "--checkpoint run --out new --word-vectors words.txt",
             ),
+        },
+    ),
+    "noise": (
+        "--truth a.json --found b.json",
+        {
+            "--truth": ("--found b.json --truth a.json", "--found b.json --truth c.json"),
+            "--found": ("--truth a.json --found b.json", "--truth a.json --found c.json"),
+            "--min-score": "--min-score 0.5",
+            "--iou": "--iou 0.7",
         },
     ),
     "demo": (
