@@ -17,7 +17,7 @@ from tdanet_jax.agent.agent import Agent
 from tdanet_jax.agent.numpy_agent import FORMAT, META_FILE, MODEL_FILE, WORDS_FILE
 from tdanet_jax.config import find_word_vectors
 from tdanet_jax.io import archive, assets, files
-from tdanet_jax.io.bundled_agents import find_run
+from tdanet_jax.io.bundled_agents import find_run, folder_of
 from tdanet_jax.models.actor_critic import SENSOR_UNITS
 from tdanet_jax.models.tdanet import TARGET_BOX
 from tdanet_jax.sensors.numpy_sensors import WIDTHS
@@ -58,7 +58,7 @@ def export(run: Path | str, folder: Path | str, word_vectors: Path | str | None 
     files.check_empty(folder)
     agent = agents.load(run, word_vectors=word_vectors)
     check(agent)
-    path = find_word_vectors(agent.config, agents.folder_of(run), word_vectors)
+    path = find_word_vectors(agent.config, folder_of(run), word_vectors)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with files.replacing(folder) as fresh:
         fresh.mkdir()

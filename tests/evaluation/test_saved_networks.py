@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +21,9 @@ from tdanet_jax.commands import share
 from tdanet_jax.commands.train_zero_shot import main as train
 from tdanet_jax.config import WORD_VECTORS_FILE, EvalConfig
 from tdanet_jax.evaluation import report, saved_networks
+from tdanet_jax.io import bundled_agents
 from tdanet_jax.scenes import SceneTables, dataset
+from tdanet_jax.splits import GROUPS
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import newest
 from tdanet_jax.words import WordVectors
@@ -65,8 +68,19 @@ def test_a_parameter_that_does_not_fit_is_one_clear_error(
 
 
 def test_the_agent_of_the_project_plays_in_the_rooms_of_the_project(ithor: SceneTables) -> None:
-    assert newest(BUNDLED).data_version == ithor.data_version
-    assert decision(BUNDLED).sum() == pytest.approx(1.0)
+    for name in bundled_agents.names():
+        run = BUNDLED.parent / name
+        assert newest(run).data_version == ithor.data_version
+        assert decision(run).sum() == pytest.approx(1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", bundled_agents.names())
+def test_the_agents_of_the_project_have_their_figures(name: str) -> None:
+    recorded = json.loads((BUNDLED.parent / name / report.RESULTS_FILE).read_text())
+    found = tdanet_jax.evaluate(name)
+    for group in GROUPS:
+        assert found[group] == recorded[group]
 
 
 def test_a_shared_agent_is_not_resumed(
