@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from tdanet_jax.commands.signals import Stopped, StopRequest
 from tdanet_jax.commands.streams import ends_with_its_reader
@@ -34,6 +34,8 @@ Arguments = TypeVar("Arguments")
 
 #: Without a terminal, progress is a line at most this often.
 SECONDS_BETWEEN_LINES = 10.0
+#: Columns from which a terminal has room for a bar next to the figures of training.
+WIDE = 104
 
 
 class PlainConsole(Console):
@@ -232,12 +234,11 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
     if console.is_terminal:
         columns = (
             TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
+            *([BarColumn(bar_width=24)] if console.width >= WIDE else []),
             TextColumn("{task.percentage:>5.1f} %"),
             TextColumn("{task.fields[figures]}", markup=False),
-            TimeElapsedColumn(),
-            TextColumn("left"),
             TimeRemainingColumn(),
+            TextColumn("left"),
         )
         with Progress(*columns, console=console, transient=transient) as bar:
             task = bar.add_task(title, total=1.0, figures="")

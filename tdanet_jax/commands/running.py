@@ -36,15 +36,23 @@ class Command:
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""
     resume: Path | None = None
-    """Folder of a run to continue. Accepts only --devices, --tensorboard, --data where the run's
+    """Folder of a run to continue. Accepts only --devices, --log, --data where the run's
     rooms were moved to, and a new budget, which replaces the run's; its schedules then follow the
     new one."""
+    log: tuple[Literal["tensorboard", "wandb", "csv"], ...] = ()
+    """Where else the metrics go: TensorBoard events (needs tensorboardX), Weights & Biases (needs
+    wandb; WANDB_MODE=offline sends nothing), metrics.csv."""
     tensorboard: bool = False
-    """Also write TensorBoard events (needs tensorboardX)."""
+    """The same as --log tensorboard."""
     devices: int = 1
     """Devices in this process to split the environments over; a CPU is split into as many. Further
     processes, on this or other machines, join through JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES
     and JAX_PROCESS_ID."""
+
+    @property
+    def sinks(self) -> tuple[str, ...]:
+        """Where else the metrics go, each once."""
+        return tuple(dict.fromkeys([*self.log, *["tensorboard"] * self.tensorboard]))
 
 
 def parse_command(arguments: Sequence[str]) -> Command:
@@ -120,16 +128,15 @@ class Reports(Callbacks):
 
 
 def figures_of(row: Row) -> str:
-    """The figures next to the progress bar."""
+    """The figures next to the progress bar; the whole line fits 80 columns."""
     skipped = f"  {row['skipped']} updates skipped" if row["skipped"] else ""
 
     def shown(name: str, factor: float, digits: int) -> str:
         return "-" if row[name] is None else f"{factor * row[name]:.{digits}f}"
 
     return (
-        f"{row['steps_per_second']:,.0f} steps/s  {row['episodes']:,} episodes  "
-        f"SR {shown('success', 100, 1)}  SPL {shown('spl', 100, 1)}  "
-        f"entropy {shown('entropy', 1, 2)}{skipped}"
+        f"{row['steps_per_second']:,.0f} steps/s  SR {shown('success', 100, 1)}  "
+        f"SPL {shown('spl', 100, 1)}  entropy {shown('entropy', 1, 2)}{skipped}"
     )
 
 

@@ -53,6 +53,7 @@ OWN = {
     "--model": "--models",
     "--seed": "--seeds",
     "--resume": "the same command again instead",
+    "--log": "none",
     "--tensorboard": "none",
 }
 

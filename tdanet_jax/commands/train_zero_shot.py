@@ -21,6 +21,7 @@ from tdanet_jax.commands.running import Command, how_to_continue, parse_command,
 from tdanet_jax.commands.streams import output_may_break
 from tdanet_jax.config import TrainConfig, run_name
 from tdanet_jax.io import files
+from tdanet_jax.training.journal import SINKS
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -41,12 +42,14 @@ def check(command: Command) -> TrainConfig:
     """The run's configuration; fails early on flags that do not go together."""
     config = command.run
     if command.resume is not None:
-        given = dataclasses.replace(command, run=TrainConfig(), devices=1, tensorboard=False)
+        given = dataclasses.replace(
+            command, run=TrainConfig(), devices=1, log=(), tensorboard=False
+        )
         new = dataclasses.replace(TrainConfig().with_budget(config), data=config.data)
         if given != Command(run=TrainConfig(), resume=command.resume) or config != new:
             fail(
                 "--resume continues a run as it began: it takes a new budget (--steps, --episodes, "
-                "--minutes), the new place of its rooms (--data), --devices and --tensorboard alone"
+                "--minutes), the new place of its rooms (--data), --devices and --log alone"
             )
         from tdanet_jax.workflows.train import resumed
 
@@ -57,8 +60,10 @@ def check(command: Command) -> TrainConfig:
         if command.out is None and os.environ.get("JAX_COORDINATOR_ADDRESS"):
             fail("a run of several processes needs --out: a folder that all of them see")
     check_positive(devices=command.devices)
-    if command.tensorboard and importlib.util.find_spec("tensorboardX") is None:
-        fail("--tensorboard needs tensorboardX: pip install tensorboardX")
+    for name in command.sinks:
+        package = SINKS[name][0]
+        if package is not None and importlib.util.find_spec(package) is None:
+            fail(f"--log {name} needs {package}: pip install {package}")
     return config
 
 
@@ -77,7 +82,7 @@ def run(command: Command, config: TrainConfig, folder: Path) -> None:
             folder,
             resume=command.resume is not None,
             device_count=command.devices,
-            tensorboard=command.tensorboard,
+            log=command.sinks,
             callbacks=reports,
         )
         if results is not None and (setting := trust(config)):

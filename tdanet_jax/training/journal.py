@@ -1,18 +1,24 @@
-"""What a run logs: rows of metrics in `metrics.jsonl`, and TensorBoard events."""
+"""What a run logs: rows of metrics in `metrics.jsonl`, and in the formats of `SINKS`."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
+import os
+import re
 import time
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from tdanet_jax.config import CONFIG_FILE
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import jsons
 
 METRICS_FILE = "metrics.jsonl"
+CSV_FILE = "metrics.csv"
 
 #: One chunk's metrics by name; `steps` and `updates` count from the start of the run.
 Row = dict[str, Any]
@@ -99,3 +105,77 @@ def tensorboard_sink(folder: Path | str) -> Callable[[Row], None]:
             warnings.warn(f"{target}: given up ({error.strerror})", stacklevel=2)
 
     return write
+
+
+def csv_sink(folder: Path | str) -> Callable[[Row], None]:
+    """A function that writes rows into `folder`/metrics.csv, after those of `metrics.jsonl`.
+
+    If they cannot be written, it gives up with a warning, and training continues.
+    """
+    folder = Path(folder)
+    path, failed = folder / CSV_FILE, False
+
+    def text(rows: list[Row], header: bool) -> str:
+        out = io.StringIO()
+        writer = csv.DictWriter(out, [*rows[0]], lineterminator="\n", extrasaction="ignore")
+        if header:
+            writer.writeheader()
+        writer.writerows(rows)
+        return out.getvalue()
+
+    there = read_metrics(folder) if (folder / METRICS_FILE).exists() else []
+    files.write_text(path, text(there, header=True) if there else "")
+
+    def write(row: Row) -> None:
+        nonlocal failed
+        if failed:
+            return
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(text([row], header=file.tell() == 0))
+        except OSError as error:
+            failed = True
+            warnings.warn(f"{path}: given up ({error.strerror})", stacklevel=2)
+
+    return write
+
+
+def wandb_sink(folder: Path | str) -> Callable[[Row], None]:
+    """A function that sends rows to Weights & Biases, or with WANDB_MODE=offline keeps them in
+    `folder`/wandb.
+
+    The run is called as its folder is, in the project "tdanet_jax" unless WANDB_PROJECT is set, and
+    is continued by a run that is resumed.
+
+    Raises:
+      ValueError: Weights & Biases refuses the run.
+    """
+    import wandb
+
+    folder = Path(folder)
+    name = folder.resolve().name
+    try:
+        run = wandb.init(
+            project=os.environ.get("WANDB_PROJECT", "tdanet_jax"),
+            name=name,
+            id=re.sub(r"[^\w-]", "-", name),
+            dir=str(folder),
+            config=jsons.load(folder / CONFIG_FILE),
+            resume="allow",
+        )
+    except wandb.Error as error:
+        raise ValueError(f"--log wandb: {' '.join(str(error).split())}") from None
+
+    def write(row: Row) -> None:
+        figures = {f"train/{name}": value for name, value in row.items() if value is not None}
+        run.log(figures, step=row["steps"])
+
+    return write
+
+
+#: What else a run can be logged in: the package that it needs, if any, and what makes its sink.
+SINKS: Mapping[str, tuple[str | None, Callable[[Path | str], Callable[[Row], None]]]] = {
+    "tensorboard": ("tensorboardX", tensorboard_sink),
+    "wandb": ("wandb", wandb_sink),
+    "csv": (None, csv_sink),
+}

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from tdanet_jax.scenes.dataset import idle_rooms
 from tdanet_jax.task import load_task, resolve
 from tdanet_jax.training import checkpoint, devices
 from tdanet_jax.training.callbacks import Callbacks
-from tdanet_jax.training.journal import Row, read_metrics, tensorboard_sink
+from tdanet_jax.training.journal import SINKS, Row, read_metrics
 from tdanet_jax.training.run import Run, chunks_together
 
 
@@ -33,6 +34,7 @@ def train(
     *,
     resume: bool = False,
     device_count: int = 1,
+    log: Sequence[str] = (),
     tensorboard: bool = False,
     callbacks: Callbacks | None = None,
 ) -> dict[str, Any] | None:
@@ -44,7 +46,8 @@ def train(
       folder: where everything is written; new or empty, unless `resume`.
       resume: continue the run in `folder` from its newest checkpoint, bit for bit.
       device_count: devices to split the environments over, in this process.
-      tensorboard: also write TensorBoard events (needs tensorboardX).
+      log: where else the metrics go: "tensorboard", "wandb", "csv" (`training.journal.SINKS`).
+      tensorboard: deprecated until 0.4, `log=["tensorboard"]`.
       callbacks: progress, and a way to stop.
 
     Returns:
@@ -56,6 +59,9 @@ def train(
         many updates were not finite; one line that names it.
     """
     folder, callbacks = Path(folder), callbacks or Callbacks()
+    if tensorboard:
+        warnings.warn('use log=["tensorboard"]', DeprecationWarning, stacklevel=2)
+        log = [*log, "tensorboard"]
     if resume:
         config = resumed(folder, config)
     elif config is None:
@@ -86,8 +92,8 @@ def train(
         if devices.is_lead():
             _prepare(run, callbacks)
         callbacks.on_note(f"{run.title} -> {folder}")
-        sink = tensorboard_sink(folder) if tensorboard and devices.is_lead() else None
-        finished = _learn([run], ([row] for row in run.chunks()), callbacks, sink)
+        sinks = [SINKS[name][1](folder) for name in log] if devices.is_lead() else []
+        finished = _learn([run], ([row] for row in run.chunks()), callbacks, sinks)
         return _report(run, lists, callbacks) if finished and devices.is_lead() else None
 
 
@@ -172,7 +178,10 @@ def _prepare(run: Run, callbacks: Callbacks) -> None:
 
 
 def _learn(
-    runs: Sequence[Run], chunks: Iterator[list[Row]], callbacks: Callbacks, sink: Any = None
+    runs: Sequence[Run],
+    chunks: Iterator[list[Row]],
+    callbacks: Callbacks,
+    sinks: Sequence[Callable[[Row], None]] = (),
 ) -> bool:
     """Trains and saves; returns False if a process has stopped it before the budget's end."""
 
@@ -186,7 +195,7 @@ def _learn(
     with callbacks.shield():
         for rows in chunks:
             callbacks.on_rows(runs, rows)
-            if sink is not None:
+            for sink in sinks:
                 sink(rows[0])
             if devices.anywhere(callbacks.should_stop()):
                 callbacks.on_stop()

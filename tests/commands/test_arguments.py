@@ -73,7 +73,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--resume broken", "broken/config.json: not JSON (Expecting property name"),
         ("--resume binary", "binary/config.json: not UTF-8"),
         ("--resume typed", "typed/config.json: --steps many: must be of type"),
-        ("--tensorboard", "--tensorboard needs tensorboardX: pip install"),
+        ("--tensorboard", "--log tensorboard needs tensorboardX: pip install"),
     ],
     "evaluate": [
         ("", "--policy sample needs --checkpoint"),

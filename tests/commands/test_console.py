@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from tdanet_jax.commands import console, evaluate
+from tdanet_jax.commands import console, evaluate, running
 
 
 @pytest.fixture
@@ -198,6 +198,29 @@ def test_names_from_files_are_printed_as_they_are(capsys: pytest.CaptureFixture[
     assert capsys.readouterr().err == (
         "warning: [/x]?[2J warning: more\nerror: [/x]?[2J error: more\n"
     )
+
+
+@pytest.mark.parametrize(("width", "bar"), [(80, False), (120, True)])
+def test_the_progress_of_training_fits_a_line(
+    width: int, bar: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = io.StringIO()
+    terminal = console.PlainConsole(file=written, force_terminal=True, width=width)
+    monkeypatch.setattr(console, "console", terminal)
+    figures = running.figures_of(
+        {
+            "steps_per_second": 18_428.0,
+            "success": 0.891,
+            "spl": 0.472,
+            "entropy": 0.27,
+            "skipped": 0,
+        }
+    )
+    with console.reporter("training") as show:
+        show(0.998, figures)
+    last = written.getvalue().rstrip("\x1b[?25h\n").splitlines()[-1]
+    assert figures in last  # nothing is cut off
+    assert ("━" in last) == bar
 
 
 def test_a_bar_shows_names_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -276,6 +276,7 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--out": ("--out new", "--out newer"),
             "--resume": ("--resume run --steps 9", "--resume other --steps 9"),
             "--tensorboard": "--tensorboard",
+            "--log": ("--log csv", "--log csv tensorboard"),
             "--devices": "--devices 2",
         },
     ),

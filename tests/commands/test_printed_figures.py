@@ -21,13 +21,13 @@ ROW: dict[str, Any] = {
     "explained_variance": 0.9375, "grad_norm": 0.6875, "learning_rate": 0.5,
     "bootstrap_only_steps": 13, "skipped": 17, "seconds": 19.5, "steps_per_second": 2468.3,
 }  # fmt: skip
-FIGURES = "2,468 steps/s  3,456 episodes  SR 12.5  SPL 6.2  entropy 1.62"
+FIGURES = "2,468 steps/s  SR 12.5  SPL 6.2  entropy 1.62"
 
 
 def test_the_figures_of_training() -> None:
     assert running.figures_of(ROW) == f"{FIGURES}  17 updates skipped"
     empty = ROW | {"success": None, "spl": None, "entropy": None, "skipped": 0}
-    assert running.figures_of(empty) == "2,468 steps/s  3,456 episodes  SR -  SPL -  entropy -"
+    assert running.figures_of(empty) == "2,468 steps/s  SR -  SPL -  entropy -"
 
 
 def test_progress_is_the_runs_own(capsys: pytest.CaptureFixture[str]) -> None:

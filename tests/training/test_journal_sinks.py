@@ -1,0 +1,97 @@
+"""Metrics in a table, and at Weights & Biases."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tdanet_jax import config as configs
+from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.training.journal import Journal, csv_sink, wandb_sink
+
+
+def row(number: int, success: float | None = 0.5) -> dict[str, Any]:
+    return {"updates": number, "steps": 40 * number, "episodes": number, "success": success}
+
+
+def table(folder: Path) -> list[dict[str, str]]:
+    with (folder / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_table_has_every_row_once_even_if_the_run_continues(tmp_path: Path) -> None:
+    journal, sink = Journal(tmp_path / "metrics.jsonl", 0), csv_sink(tmp_path)
+    for number in (1, 2, 3):
+        for write in (journal.write, sink):
+            write(row(number, None if number == 1 else 0.25))
+    expected = [{"updates": "1", "steps": "40", "episodes": "1", "success": ""}]
+    expected += [
+        {"updates": str(n), "steps": str(40 * n), "episodes": str(n), "success": "0.25"}
+        for n in (2, 3)
+    ]
+    assert table(tmp_path) == expected
+    journal = Journal(tmp_path / "metrics.jsonl", 2)  # its checkpoint is older than the last row
+    csv_sink(tmp_path)(row(3, 0.75))
+    assert table(tmp_path) == [*expected[:2], expected[2] | {"success": "0.75"}]
+
+
+def test_training_goes_on_without_a_table(tmp_path: Path) -> None:
+    sink = csv_sink(tmp_path)
+    (tmp_path / "metrics.csv").unlink()
+    (tmp_path / "metrics.csv").mkdir()
+    with pytest.warns(UserWarning, match="metrics.csv: given up"):
+        sink(row(1))
+    sink(row(2))  # without a further warning
+
+
+class Wandb(ModuleType):
+    """Weights & Biases' part that is used."""
+
+    class Error(Exception):
+        pass
+
+    def __init__(self, refuses: str = "") -> None:
+        super().__init__("wandb")
+        self.begun: dict[str, Any] = {}
+        self.logged: list[tuple[int, dict[str, float]]] = []
+        self.refuses = refuses
+
+    def init(self, **options: Any) -> SimpleNamespace:
+        if self.refuses:
+            raise self.Error(self.refuses)
+        self.begun = options
+        return SimpleNamespace(log=lambda figures, step: self.logged.append((step, figures)))
+
+
+def test_weights_and_biases_get_the_run_and_every_figure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "my run"
+    folder.mkdir()
+    configs.save(TrainConfig(seed=7), folder / CONFIG_FILE)
+    fake = Wandb()
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    monkeypatch.delenv("WANDB_PROJECT", raising=False)
+    sink = wandb_sink(folder)
+    sink(row(2, None))
+    assert fake.logged == [(80, {"train/updates": 2, "train/steps": 80, "train/episodes": 2})]
+    assert fake.begun == {
+        "project": "tdanet_jax", "name": "my run", "id": "my-run", "dir": str(folder),
+        "config": json.loads((folder / CONFIG_FILE).read_text()), "resume": "allow",
+    }  # fmt: skip
+    assert fake.begun["config"]["seed"] == 7
+
+
+def test_what_weights_and_biases_refuse_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    configs.save(TrainConfig(), tmp_path / CONFIG_FILE)
+    monkeypatch.setitem(sys.modules, "wandb", Wandb("no API key\n  configured"))
+    with pytest.raises(ValueError, match=r"^--log wandb: no API key configured$"):
+        wandb_sink(tmp_path)
