@@ -129,7 +129,7 @@ def decide_alike(agent, some_rooms, glove, rotation=0, steps=3):
     return stopped
 
 
-@pytest.mark.parametrize("rotation", [0, 225])
+@pytest.mark.parametrize("rotation", [pytest.param(0, marks=pytest.mark.slow), 225])
 @pytest.mark.parametrize(
     "who",
     [

@@ -190,9 +190,8 @@ def bundled(tmp_path_factory):
     return tdanet_jax.export("18-4-best", tmp_path_factory.mktemp("robot") / "exported")
 
 
-@pytest.mark.parametrize(
-    "python", [sys.executable, pytest.param("python3.10", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("python", [sys.executable, "python3.10"])
 def test_the_loop_of_the_page_runs_with_numpy_alone(python, bundled):
     if shutil.which(python) is None:
         pytest.skip(f"no {python}")

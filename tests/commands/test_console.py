@@ -219,7 +219,7 @@ def test_the_progress_of_training_fits_a_line(
     with console.reporter("training") as show:
         show(0.998, figures)
     last = written.getvalue().rstrip("\x1b[?25h\n").splitlines()[-1]
-    assert figures in last  # nothing is cut off
+    assert " ".join(figures.split()) in last  # nothing is cut off
     assert ("━" in last) == bar
 
 

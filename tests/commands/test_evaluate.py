@@ -66,6 +66,7 @@ def runs(ithor, glove, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_the_history_of_two_runs_gives_a_curve_and_all_records(runs, few_episodes, tmp_path):
     out = tmp_path / "curve"
     chosen = [f"--checkpoint={runs / name}" for name in ("seed0", "seed1")]

@@ -63,6 +63,7 @@ def test_wrong_arguments_give_one_line_and_write_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ithor", "few_episodes")
 def test_a_small_sweep_trains_evaluates_the_history_and_reports(tmp_path, monkeypatch, capsys):
     """What it compares with, and times, are made up here."""

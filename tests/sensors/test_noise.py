@@ -303,6 +303,7 @@ def walks(some_rooms: SceneTables) -> dict[str, tuple]:
     return {name: walk(p) for name, p in (("plain", plain), ("still", still), ("mix", noisy))}
 
 
+@pytest.mark.slow
 def test_levels_of_zero_show_and_sense_what_no_noise_does(walks: dict[str, tuple]) -> None:
     (plain, *rest), (still, *others) = walks["plain"], walks["still"]
     chex.assert_trees_all_equal(still.replace(sensors={}), plain.replace(sensors={}))
@@ -313,6 +314,7 @@ def test_levels_of_zero_show_and_sense_what_no_noise_does(walks: dict[str, tuple
     chex.assert_trees_all_equal(rest[:3], others[:3])
 
 
+@pytest.mark.slow
 def test_the_world_stays_as_it_is(walks: dict[str, tuple]) -> None:
     (plain, *rest), (noisy, *others) = walks["plain"], walks["mix"]
     chex.assert_trees_all_equal(rest[:3], others[:3])  # poses, rewards, successes

@@ -263,6 +263,7 @@ def test_beyond_64_cells_the_map_begins_anew_and_the_position_does_not(diagonal:
     assert seen.window[65][FRONT] & BLOCKED
 
 
+@pytest.mark.slow
 def test_compiled_is_eager_and_many_are_one_by_one() -> None:
     starts = [(0, 0), (1, 1), (1, 0)]
     walks = [wandering(seed, 8) for seed in range(len(starts))]

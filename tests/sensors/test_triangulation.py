@@ -623,6 +623,7 @@ def test_who_stands_still_reads_the_same_in_another_direction(
         np.testing.assert_allclose(np.stack(axes(agent.heading)).T @ row[:3], there, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_compiled_is_eager_and_many_are_one_by_one() -> None:
     runs = [(MOVE_AHEAD, False, 3), (ROTATE_RIGHT, False, 1), (MOVE_AHEAD, True, 1)]
     starts = [(False, 0), (True, 1), (True, 0)]
@@ -793,6 +794,7 @@ def test_who_is_certain_is_rarely_wrong_about_the_reach(some_rooms: SceneTables)
     assert visible[near].mean() > 0.8
 
 
+@pytest.mark.slow
 def test_an_automatic_reset_begins_anew() -> None:
     tables, batch, rng = toy_rooms(), 32, np.random.default_rng(4)
     params = params_of(tables, triangulation=True, limit=7)

@@ -25,6 +25,7 @@ PLAN = [
 NAMES = ["no noise 0", "failed turns 1", "nothing 0"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_episodes")
 def test_a_sweep_compares_each_level_with_the_agent_without_noise(
     ithor: SceneTables, glove: WordVectors, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
