@@ -284,7 +284,7 @@ def test_a_few_odd_values(good: Seeds, which: int, share: float, value: object) 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", range(22))
 def test_many_mutations(good: Seeds, which: int) -> None:
-    """10,000 of each kind; 1,000 of arrays in checkpoints, on which TensorStore sometimes crashes."""
+    """10,000 of each kind; 1,000 of arrays in checkpoints, on which TensorStore may crash."""
     path, data, read = good[which % len(good)]
     count = 1_000 if path.parent.name == "d" else 10_000
 
