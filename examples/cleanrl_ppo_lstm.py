@@ -37,7 +37,7 @@ class Args:
     seed: int = 0
     """seed of the experiment"""
     torch_deterministic: bool = True
-    """if toggled, `torch.backends.cudnn.deterministic=False`"""
+    """choose deterministic algorithms on a GPU"""
     cuda: bool = True
     """use a GPU if there is one"""
     total_timesteps: int = 2_000_000

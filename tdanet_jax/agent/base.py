@@ -1,4 +1,4 @@
-"""What agents have in common, whatever computes their network. Imports no JAX."""
+"""What agents with JAX and without have in common. Imports no JAX."""
 
 from __future__ import annotations
 

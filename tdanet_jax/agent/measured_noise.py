@@ -6,7 +6,7 @@ The result is a `SenseNoise`, with which agents can be evaluated and trained (do
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ class Measured:
     Attributes:
       images: number of images.
       objects: labelled objects in them.
-      found: objects with a detection, whatever its label.
+      found: objects with a detection, under any label.
       mislabelled: objects found with another label than their own.
       duplicated: detections of an object that has one already.
       invented: all other detections.
@@ -94,7 +94,7 @@ def measure(
         "jitter": float(np.sqrt(np.mean(np.square(errors)))) if errors else 0.0,
         "scores": _uncertainty(right),
     }
-    noise = SenseNoise(**{n: min(round(x, 3), highest(n)) for n, x in levels.items()})
+    noise = _noise(levels)
     return Measured(len(truth), objects, matched, mislabelled, duplicated, invented, noise)
 
 
@@ -122,6 +122,11 @@ def from_confusion(matrix: np.ndarray, images: int) -> SenseNoise:
         "swaps": (found.sum() - np.trace(found)) / max(found.sum(), 1),
         "false_positives": matrix[:-1, -1].sum() / images,
     }
+    return _noise(levels)
+
+
+def _noise(levels: Mapping[str, float]) -> SenseNoise:
+    """Levels rounded to three digits, as far as levels go."""
     return SenseNoise(**{n: min(round(float(x), 3), highest(n)) for n, x in levels.items()})
 
 
@@ -141,7 +146,10 @@ def read_coco(
     """
     truth, found = Path(truth), Path(found)
     whole = jsons.load(truth)
-    lists = {name: _entries(truth, whole, name) for name in ("images", "annotations", "categories")}
+    lists = {
+        name: _entries(truth, whole.get(name) if isinstance(whole, dict) else None, f"{name}: ")
+        for name in ("images", "annotations", "categories")
+    }
     names = {
         _key(truth, f"categories, {i}", one, "id"): str(one.get("name"))
         for i, one in enumerate(lists["categories"])
@@ -159,18 +167,16 @@ def read_coco(
     for i, one in enumerate(lists["annotations"]):
         if not one.get("iscrowd"):
             _add(truth, f"annotations, {i}", one, names, sizes, there)
-    listed = jsons.load(found)
-    for i, one in enumerate(_entries(found, {"": listed}, "")):
+    for i, one in enumerate(_entries(found, jsons.load(found))):
         score = jsons.number(found, one.get("score"), f"{i}, score", 1)
         if score >= least_score:
             _add(found, str(i), one, names, sizes, seen, max(score, 0.0))
     return [*there.values()], [*seen.values()]
 
 
-def _entries(path: Path, whole: Any, name: str) -> list[dict[str, Any]]:
-    listed = whole.get(name) if isinstance(whole, dict) else None
+def _entries(path: Path, listed: Any, at: str = "") -> list[dict[str, Any]]:
     if not isinstance(listed, list) or not all(isinstance(one, dict) for one in listed):
-        raise FileError(path, f"{name}: not a list of objects" if name else "not a list of objects")
+        raise FileError(path, f"{at}not a list of objects")
     return listed
 
 

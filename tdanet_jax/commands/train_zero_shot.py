@@ -58,7 +58,7 @@ def check(command: Command) -> TrainConfig:
         config.check()
         config = config.normalised()
         if command.out is None and os.environ.get("JAX_COORDINATOR_ADDRESS"):
-            fail("a run of several processes needs --out: a folder that all of them see")
+            fail("a run of several processes needs --out: a folder that all of them can reach")
     check_positive(devices=command.devices)
     for name in command.sinks:
         package = SINKS[name][0]
