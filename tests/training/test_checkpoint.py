@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import shutil
 import subprocess
 import warnings
@@ -45,13 +46,15 @@ def make_state() -> TrainState:
     return init(jax.random.key(3), LearnerConfig(num_envs=4), MODEL, WORDS, PARAMS)
 
 
-STATE = make_state()
+@functools.cache  # not when tests are collected, which every worker does
+def first_state() -> TrainState:
+    return jax.jit(make_state)()
 
 
 def after(updates: int) -> TrainState:
     """A state that differs with the number of updates."""
-    params = jax.tree.map(lambda x: x + updates, STATE.params)
-    return STATE.replace(params=params, updates=jnp.int32(updates))
+    params = jax.tree.map(lambda x: x + updates, first_state().params)
+    return first_state().replace(params=params, updates=jnp.int32(updates))
 
 
 def plain(state: TrainState) -> TrainState:
