@@ -34,7 +34,7 @@ from tdanet_jax.commands.console import (
     one_line_errors,
     parse,
 )
-from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.config import PRESETS, NetworkConfig, TrainConfig
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
@@ -44,8 +44,10 @@ if TYPE_CHECKING:
 
 Part = Literal[
     "tables", "import", "startup", "machine", "environment", "rollout", "update", "evaluation",
-    "decision",
+    "decision", "quality",
 ]  # fmt: skip
+#: What is measured if `--parts` is not given: all that takes no training.
+SHORT = tuple(part for part in get_args(Part) if part != "quality")
 Precision = Literal["auto", "float32", "bfloat16"]
 
 
@@ -53,8 +55,8 @@ Precision = Literal["auto", "float32", "bfloat16"]
 class Command:
     """Measures the speed of environment, rollout, update, evaluation and decisions."""
 
-    parts: tuple[Part, ...] = get_args(Part)
-    """What to measure."""
+    parts: tuple[Part, ...] = SHORT
+    """What to measure; `quality`, which trains for minutes, only if it is named."""
     environments: tuple[int, ...] = (1024, 4096, 16384)
     """Numbers of environments in the `environment` part."""
     batches: tuple[int, ...] = (256, 512, 1024)
@@ -76,6 +78,13 @@ class Command:
     devices: int = 1
     """Devices that the environments of the `environment` part are split over; a CPU is split into
     as many."""
+    preset: Literal["default", "best", "robust", "paper"] = "default"
+    """Preset that the `quality` part trains, on validation, until two evaluations in a row reach
+    the paper's figures on split 18/4."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the `quality` part, one run each."""
+    most_steps: int = 6_000_000
+    """Budget of each run of the `quality` part, in environment steps."""
     repeats: int = 5
     """Repetitions of each measurement."""
     out: Path | None = None
@@ -87,6 +96,13 @@ class Command:
             odometry=self.odometry, triangulation=self.triangulation, precision=precision
         )
         return TrainConfig(model=model, network=network, data=self.data)
+
+    def trained(self) -> list[TrainConfig]:
+        """The runs of the `quality` part."""
+        chosen = dataclasses.replace(
+            PRESETS[self.preset], episodes=None, steps=self.most_steps, validation=True
+        )
+        return [dataclasses.replace(chosen, seed=seed, data=self.data) for seed in self.seeds]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -101,7 +117,10 @@ def main(arguments: list[str] | None = None) -> None:
             environments=command.environments,
             batches=command.batches,
             networks=command.networks,
+            most_steps=command.most_steps,
         )
+        for config in command.trained():
+            config.check()
         for name in command.models:
             command.config(name).check()
         if command.odometry and not {"rollout", "update", "decision"} & set(command.parts):
@@ -160,6 +179,11 @@ def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
     if "evaluation" in command.parts:
         for networks in command.networks:
             yield benchmarking.evaluation_row(command.checkpoint, task, networks, command.repeats)
+    if "quality" in command.parts:
+        from tdanet_jax.tools import quality
+
+        for config in command.trained():
+            yield {"preset": command.preset, **quality.quality_row(config)}
     sensors = {"odometry": command.odometry, "triangulation": command.triangulation}
     for name in command.models:
         for row in model_rows(command, name, peak):
@@ -291,7 +315,7 @@ def as_table(rows: list[Row]) -> Table:
     table = Table("part", "setting", "results")
     settings = (
         "environments", "devices", "observations", "precision", "model", "odometry",
-        "triangulation", "batch", "networks", "episodes",
+        "triangulation", "batch", "networks", "preset", "seed",
     )  # fmt: skip
     for row in rows:
         setting = ", ".join(f"{k} {row[k]}" for k in settings if k in row)

@@ -152,6 +152,7 @@ def prepare_benchmark(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.evaluation.saved_networks.find", gives=None)
     recorder.record("tdanet_jax.tools.benchmarking.share_of_peak", gives=dict)
     recorder.record("tdanet_jax.tools.benchmarking.machine_row", *BENCHMARKS, gives=row)
+    recorder.record("tdanet_jax.tools.quality.quality_row", gives=row)
     for part in ("tables", "import", "startup"):
         recorder.record(f"tdanet_jax.commands.benchmark.{part}_row", gives=row)
 
@@ -405,6 +406,9 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--triangulation": ("--odometry", "--odometry --triangulation"),
             "--data": "--data rooms.npz",
             "--devices": "--devices 2",
+            "--preset": ("--parts quality", "--parts quality --preset best"),
+            "--seeds": ("--parts quality", "--parts quality --seeds 8"),
+            "--most-steps": ("--parts quality", "--parts quality --most-steps 8"),
             "--repeats": "--repeats 8",
             "--out": ("--parts decision", "--parts decision --out new.jsonl"),
         },
