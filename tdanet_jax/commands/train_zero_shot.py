@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-import os
 import sys
 import time
 from pathlib import Path
@@ -21,6 +20,7 @@ from tdanet_jax.commands.running import Command, how_to_continue, parse_command,
 from tdanet_jax.commands.streams import output_may_break
 from tdanet_jax.config import TrainConfig, run_name
 from tdanet_jax.io import files
+from tdanet_jax.training import cluster
 from tdanet_jax.training.journal import SINKS
 
 
@@ -31,8 +31,7 @@ def main(arguments: list[str] | None = None) -> None:
         command = parse_command(words)
         config = check(command)
         folder = command.resume or command.out or default_folder(config)
-        joined = bool(os.environ.get("JAX_COORDINATOR_ADDRESS"))
-        if command.resume is None and not joined:
+        if command.resume is None and not cluster.several():
             files.check_empty(folder, f" (to continue there: --resume {folder})")
         with output_may_break():
             run(command, config, folder)
@@ -57,7 +56,7 @@ def check(command: Command) -> TrainConfig:
     else:
         config.check()
         config = config.normalised()
-        if command.out is None and os.environ.get("JAX_COORDINATOR_ADDRESS"):
+        if command.out is None and cluster.several():
             fail("a run of several processes needs --out: a folder that all of them can reach")
     check_positive(devices=command.devices)
     for name in command.sinks:

@@ -51,7 +51,9 @@ def until_passed(evaluations: Iterable[tuple[Bar, Row]], bar: Bar) -> tuple[bool
     Returns:
       Whether they did; what had been spent at the first of them, or in the end; the last figures.
     """
-    passed, spent, figures = 0, {}, {}
+    passed = 0
+    spent: Row = {}
+    figures: Bar = {}
     for figures, now in evaluations:
         passed = passed + 1 if passes(figures, bar) else 0
         if passed <= 1:

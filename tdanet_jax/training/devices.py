@@ -4,13 +4,15 @@ XLA partitions the compiled update by the sharding of its arguments; the learner
 devices. Random numbers depend on an environment's index in the whole batch: an update on many
 devices equals one on a single device, except for the order in which gradients are added.
 
-Several machines, or several processes on one, run the same command with the variables
-JAX_COORDINATOR_ADDRESS (host:port of the first), JAX_NUM_PROCESSES and JAX_PROCESS_ID.
+Several machines, or several processes on one, run the same command, started by SLURM or Open MPI,
+or with the variables JAX_COORDINATOR_ADDRESS (host:port of the first), JAX_NUM_PROCESSES and
+JAX_PROCESS_ID (`cluster`).
 """
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 from typing import Any
 
@@ -21,13 +23,16 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from tdanet_jax.io import files
 from tdanet_jax.scenes import cache
+from tdanet_jax.training.cluster import ADDRESS, LAUNCHERS, PROCESS, PROCESSES, launcher
 from tdanet_jax.training.learner import TrainState
 
 AXIS = "environments"
 PLATFORMS = "JAX_PLATFORMS"
-ADDRESS, PROCESSES, PROCESS = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
 #: Size of the cache of compiled programs, in bytes.
 COMPILED_SIZE = 2**30
+
+# JAX logs why it cannot join a launcher's processes, and raises, too.
+logging.getLogger("jax._src.clusters.cluster").setLevel(logging.CRITICAL)
 
 
 def keep_compiled() -> None:
@@ -81,7 +86,14 @@ def connect(count: int = 1) -> Mesh:
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", count)
     if address := os.environ.get(ADDRESS):
-        _join(address)
+        _join_at(address)
+    elif name := launcher():
+        variable = f"{LAUNCHERS[name]}={os.environ[LAUNCHERS[name]]}"
+        try:
+            _join(variable, cluster_detection_method=name)
+        except ValueError as error:
+            own = f"{ADDRESS}, {PROCESSES} and {PROCESS}"
+            raise ValueError(f"{error}; set {own} to say who is who") from None
     start()
     if jax.local_device_count() < count:
         raise ValueError(f"--devices {count}: this machine has {jax.local_device_count()}")
@@ -91,7 +103,7 @@ def connect(count: int = 1) -> Mesh:
     return Mesh(np.array(chosen), (AXIS,))
 
 
-def _join(address: str) -> None:
+def _join_at(address: str) -> None:
     """Joins the processes whose first one is at an address, HOST:PORT."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
@@ -104,13 +116,23 @@ def _join(address: str) -> None:
         raise ValueError(
             f"{PROCESS}={process}: must be from 0 to {processes - 1}, below {PROCESSES}"
         )
+    _join(
+        f"{ADDRESS}={address}",
+        coordinator_address=address,
+        num_processes=processes,
+        process_id=process,
+    )
+
+
+def _join(variable: str, **arguments: Any) -> None:
+    """Joins the other processes; an error names the variable that asked for it."""
     # Processes on CPUs deadlock if each reduces in its own order.
     flag = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}"
     try:
-        jax.distributed.initialize(address, processes, process)
-    except RuntimeError as error:
-        raise ValueError(f"{ADDRESS}={address}: {_first_line(error)}") from None
+        jax.distributed.initialize(**arguments)
+    except (RuntimeError, ValueError) as error:  # JAX's own errors, and those of a bad address
+        raise ValueError(f"{variable}: {_first_line(error)}") from None
 
 
 def first() -> Mesh:

@@ -148,25 +148,37 @@ def test_a_split_of_ones_own_is_trained_evaluated_and_gone_on_with(
 SENSES = ("--odometry", "--triangulation")
 
 
+def own_variables():
+    """Who is who, for two processes on this machine: how process `number` hears of it."""
+    port = free_port()
+    return lambda number: {
+        "JAX_COORDINATOR_ADDRESS": f"localhost:{port}",
+        "JAX_NUM_PROCESSES": "2",
+        "JAX_PROCESS_ID": str(number),
+    }
+
+
+def slurms_variables():
+    """The same as a step of a SLURM job hears it; JAX takes a port from the job's number."""
+    job = next(n for n in range(4096) if is_free(61440 + n))
+    return lambda number: {
+        "SLURM_JOB_ID": str(job), "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": "2",
+        "SLURM_STEP_NUM_TASKS": "2", "SLURM_PROCID": str(number), "SLURM_LOCALID": str(number),
+    }  # fmt: skip
+
+
 @pytest.mark.slow
-def test_two_processes_train_together_and_one_goes_on_alone(ithor, tmp_path):
+@pytest.mark.parametrize("who_is_who", [own_variables, slurms_variables])
+def test_two_processes_train_together_and_one_goes_on_alone(who_is_who, ithor, tmp_path):
     """The environments of one run in two processes; one process continues from what they saved.
 
     With odometry and triangulation: every environment has a map of its own.
     """
     out = tmp_path / "run"
     arguments = ["--steps", "2400", "--devices", "2", *SENSES, *command.TINY, "--out", out]
-    port = free_port()
+    variables = who_is_who()
     both = [
-        command.start(
-            "train_zero_shot",
-            *arguments,
-            variables={
-                "JAX_COORDINATOR_ADDRESS": f"localhost:{port}",
-                "JAX_NUM_PROCESSES": "2",
-                "JAX_PROCESS_ID": str(number),
-            },
-        )
+        command.start("train_zero_shot", *arguments, variables=variables(number))
         for number in (0, 1)
     ]
     said = [process.communicate(timeout=600)[0] for process in both]
@@ -186,6 +198,11 @@ def test_two_processes_train_together_and_one_goes_on_alone(ithor, tmp_path):
     page = (out / "results.md").read_text()
     assert page.startswith("# tdanet, --odometry, --triangulation, split")
     assert len((out / "metrics.jsonl").read_text().splitlines()) == 8
+
+
+def is_free(port):
+    with socket.socket() as listener:
+        return listener.connect_ex(("localhost", port)) != 0
 
 
 def free_port():

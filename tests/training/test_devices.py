@@ -12,7 +12,7 @@ import pytest
 
 from tdanet_jax.config import PRESETS, LearnerConfig, TrainConfig
 from tdanet_jax.task import make_task
-from tdanet_jax.training import devices, learner
+from tdanet_jax.training import cluster, devices, learner
 from tdanet_jax.workflows import train as training
 
 #: In a process of its own, which alone can split its CPU into eight devices.
@@ -142,7 +142,7 @@ def test_a_jax_that_cannot_be_started_is_one_clear_error(monkeypatch, platform, 
 def test_processes_that_cannot_join_are_one_clear_error(
     monkeypatch, address, processes, process, what
 ):
-    def initialize(*arguments):
+    def initialize(**arguments):
         raise RuntimeError("no answer\nmore")
 
     monkeypatch.setattr(jax.distributed, "initialize", initialize)
@@ -152,6 +152,37 @@ def test_processes_that_cannot_join_are_one_clear_error(
     ):  # fmt: skip
         monkeypatch.setenv(name, value)
     with pytest.raises(ValueError, match=what):
+        devices.connect()
+
+
+def test_a_launcher_says_who_is_who(monkeypatch):
+    heard = []
+    monkeypatch.setattr(jax.distributed, "initialize", lambda **arguments: heard.append(arguments))
+    monkeypatch.setenv("XLA_FLAGS", "")
+    for name, variable in cluster.LAUNCHERS.items():
+        for count, several in (("1", False), ("2", True)):
+            with monkeypatch.context() as patch:
+                patch.setenv(variable, count)
+                assert cluster.several() == several
+                devices.connect()
+            assert heard == [{"cluster_detection_method": name}] * several
+        heard.clear()
+    monkeypatch.setenv("SLURM_NTASKS", "2")  # a job script, which is one process
+    assert not cluster.several()
+
+
+def test_ones_own_variables_come_before_a_launchers(monkeypatch):
+    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "2")
+    monkeypatch.setenv(devices.ADDRESS, "host0")
+    assert cluster.several()
+    with pytest.raises(ValueError, match="JAX_COORDINATOR_ADDRESS=host0: must be"):
+        devices.connect()
+
+
+def test_a_launcher_that_jax_cannot_read_is_one_clear_error(monkeypatch):
+    monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "2")
+    monkeypatch.setenv("XLA_FLAGS", "")
+    with pytest.raises(ValueError, match=r"^OMPI_COMM_WORLD_SIZE=2: .*; set JAX_COORDINATOR_ADDR"):
         devices.connect()
 
 
