@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import difflib
 import io
 import itertools
 import logging
@@ -64,8 +65,10 @@ def fail(message: object) -> NoReturn:
 
 
 @contextlib.contextmanager
-def one_line_usage() -> Iterator[None]:
-    """Reduces tyro's boxed usage error to its first paragraph, on one line."""
+def one_line_usage(where: str = "") -> Iterator[None]:
+    """Reduces tyro's boxed usage error to one line: `where`, its first paragraph, and the known
+    flags that are nearest to unknown ones.
+    """
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said), _registry:
@@ -75,7 +78,18 @@ def one_line_usage() -> Iterator[None]:
             raise
         lines = [line.strip("│ ") for line in said.getvalue().splitlines()[1:]]  # [0]: a title
         words = itertools.dropwhile(_is_rule, lines)
-        fail(" ".join(itertools.takewhile(lambda line: not _is_rule(line), words)))
+        message = " ".join(itertools.takewhile(lambda line: not _is_rule(line), words))
+        fail(where + message + _did_you_mean(message, lines))
+
+
+def _did_you_mean(message: str, lines: Sequence[str]) -> str:
+    """The flags that tyro's box lists below an error that are nearest to unknown ones."""
+    if not message.startswith("Unrecognized options: "):
+        return ""
+    listed = [line.split()[0].rstrip(",") for line in lines if line.startswith("--")]
+    unknown = re.findall(r"--[\w-]+", message)
+    near = [name for one in unknown for name in difflib.get_close_matches(one, listed, 1)]
+    return f"; did you mean {', '.join(near)}?" if near else ""
 
 
 def _is_rule(line: str) -> bool:
@@ -130,9 +144,11 @@ def whole_number(text: str) -> int:
         return int(number)
 
 
-def parse(command: type[Arguments], arguments: Sequence[str] | None, **options: Any) -> Arguments:
-    """`tyro.cli`, with errors in one line."""
-    with one_line_usage():
+def parse(
+    command: type[Arguments], arguments: Sequence[str] | None, where: str = "", **options: Any
+) -> Arguments:
+    """`tyro.cli`, with errors in one line that starts with `where`."""
+    with one_line_usage(where):
         return tyro.cli(command, args=arguments, **options)
 
 

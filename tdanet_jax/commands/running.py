@@ -55,14 +55,19 @@ class Command:
         return tuple(dict.fromkeys([*self.log, *["tensorboard"] * self.tensorboard]))
 
 
-def parse_command(arguments: Sequence[str]) -> Command:
-    """The command line of training; `--preset` chooses the defaults of the other flags."""
+def parse_command(arguments: Sequence[str], where: str = "") -> Command:
+    """The command line of training; `--preset` chooses the defaults of the other flags.
+
+    Args:
+      arguments: the command line; a later value of a flag replaces an earlier one.
+      where: what the line of an error starts with.
+    """
     preset = "default"
     for i, word in enumerate(arguments):
         if word.startswith("--preset"):
             preset = word.partition("=")[2] or "".join(arguments[i + 1 : i + 2])
     default = Command(run=PRESETS.get(preset, PRESETS["default"]))
-    return parse(Command, arguments, default=default, prog="tdanet train")
+    return parse(Command, arguments, where, default=default, prog="tdanet train")
 
 
 @contextlib.contextmanager

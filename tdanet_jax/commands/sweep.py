@@ -3,18 +3,21 @@
     tdanet sweep --splits 18/4 14/8 --seeds 0 1 2 --minutes 10 --out runs/sweep
 
 Every other flag is one of the training command and applies to all runs. After an interruption, run
-the same command again: it skips the finished runs and continues the unfinished one. Writes a folder
-for each run, report.md, report.json and the learning curves into --out.
+the same command again: it skips the finished runs and continues the unfinished one. It leaves the
+runs that another process trains to it, and exits with status 1 if the report lacks any of them.
+Writes a folder for each run, report.md, report.json and the learning curves into --out.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import difflib
 import functools
 import itertools
 import json
 import os
+import shlex
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -47,6 +50,8 @@ BATCHES = (1, 1024)
 UNTRAINED_SEED = 0
 #: Exit statuses above this one mean that a signal stopped the program.
 SIGNALLED = 128
+#: Exit status if the report lacks runs that were left to other processes.
+INCOMPLETE = 1
 #: Flags of the training command that a sweep sets itself.
 OWN = {
     "--split": "--splits",
@@ -56,6 +61,8 @@ OWN = {
     "--log": "none",
     "--tensorboard": "none",
 }
+#: Flags of the training command that all models of a sweep share.
+SHARED = ("--out", "--devices", "--data", "--targets", "--validation")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +78,8 @@ class Command:
     """Models to train, ablations included; see --model of `tdanet train`."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of each."""
+    per_model: tuple[str, ...] = ()
+    """Flags for one model alone, in quotes: "savn: --num-envs 64 --learning-rate 1e-3"."""
     vmap_seeds: bool = False
     """Train the seeds of a split and model in one vmapped call; needs a budget in steps. For
     accelerators: on a CPU it is slower than one seed after the other, unless networks are small."""
@@ -94,13 +103,11 @@ def main(arguments: list[str] | None = None) -> None:
             )
         if command.report_only and rest:
             fail(f"--report-only trains nothing and takes no {rest[0]}")
-        for word in rest:
-            if word.partition("=")[0] in OWN:
-                fail(f"{word}: a sweep takes {OWN[word.partition('=')[0]]}")
+        check_own(rest)
         training = parse_command(rest)
-        base = training.run.normalised()
-        configs = sweep.plan(base, command.splits, command.models, command.seeds)
-        if command.vmap_seeds and (base.episodes is not None or base.minutes is not None):
+        base, per_model = training.run.normalised(), parse_per_model(command, rest)
+        configs = sweep.plan(base, command.splits, command.models, command.seeds, per_model)
+        if command.vmap_seeds and any({*config.budget} - {"steps"} for config in configs):
             fail("--vmap-seeds needs a budget in --steps: all seeds must end together")
         if command.vmap_seeds and training.devices > 1:
             fail("--vmap-seeds and --devices: choose one")
@@ -116,6 +123,45 @@ def main(arguments: list[str] | None = None) -> None:
             run(command, training, configs, included)
 
 
+def check_own(words: Sequence[str], where: str = "") -> None:
+    """Fails if there is a flag of the training command that a sweep sets itself."""
+    for word in words:
+        if word.partition("=")[0] in OWN:
+            fail(f"{where}{word}: a sweep takes {OWN[word.partition('=')[0]]}")
+
+
+def parse_per_model(command: Command, rest: Sequence[str]) -> dict[str, TrainConfig]:
+    """The configurations of the models with flags of their own.
+
+    Args:
+      command: the sweep.
+      rest: the flags of the training command that apply to all runs.
+    """
+    out: dict[str, TrainConfig] = {}
+    for given in command.per_model:
+        model, colon, flags = given.partition(":")
+        where = f"--per-model {model}: "
+        if not colon:
+            fail(f'--per-model {given}: write "MODEL: FLAGS", in quotes')
+        if model not in command.models:
+            near = difflib.get_close_matches(model, command.models, 1)
+            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(command.models)}"
+            fail(f"{where}not one of --models; {hint}")
+        if model in out:
+            fail(f"{where}is given twice")
+        try:
+            words = shlex.split(flags)
+            check_own(words, where)
+            for word in words:
+                if word.partition("=")[0].replace("_", "-").replace("--no-", "--") in SHARED:
+                    fail(f"{where}{word}: must be the same for all models")
+            out[model] = parse_command([*rest, *words], where).run.normalised()
+            out[model].check()
+        except ValueError as error:
+            fail(f"{where}{error}")
+    return out
+
+
 def run(
     command: Command,
     training: TrainingCommand,
@@ -124,49 +170,87 @@ def run(
 ) -> None:
     """Trains and reports; says how to continue if a signal stops it."""
     try:
-        if not command.report_only:
-            train_all(command, training, configs)
+        left = [] if command.report_only else train_all(command, training, configs)
         with stoppable(lambda: "finished evaluations are kept"):
-            write_report(command.out, included)
+            unfinished = write_report(command.out, included, left)
     except SystemExit as stop:
         if isinstance(stop.code, int) and stop.code > SIGNALLED:
             console.print("run the same command again to continue the sweep")
         raise
+    if left:
+        console.print(f"left to other processes: {', '.join(folder.name for folder in left)}")
+    if missing := [folder.name for folder in left if folder in unfinished]:
+        console.print(f"missing from the report, as not finished: {', '.join(missing)}")
+        raise SystemExit(INCOMPLETE)
 
 
-def train_all(command: Command, training: TrainingCommand, configs: Sequence[TrainConfig]) -> None:
+def train_all(
+    command: Command, training: TrainingCommand, configs: Sequence[TrainConfig]
+) -> list[Path]:
     """Trains the runs that are not finished.
 
     Args:
+      command: the sweep.
       training: the flags of the training command.
       configs: all runs.
+
+    Returns:
+      The folders of runs that are left to other processes, which train them.
     """
     from tdanet_jax.models.classes import ClassVocabulary
     from tdanet_jax.models.factory import make_model
     from tdanet_jax.task import resolve
     from tdanet_jax.training import devices
-    from tdanet_jax.workflows.train import train, train_together
 
-    devices.connect(training.devices)
+    mesh = devices.connect(training.devices)
     devices.keep_compiled()
     todo = []
     # A clash, or a model that cannot be made, shows before anything trains.
     for config in map(resolve, configs):
         make_model(config, ClassVocabulary())
+        devices.check_divides(config.learner.num_envs, mesh)
         folder = command.out / run_name(config)
         if sweep.progress(folder, config) != "finished":
             todo.append((config, folder))
     console.print(f"{len(configs)} runs, {len(configs) - len(todo)} finished, {len(todo)} to train")
-    if command.vmap_seeds:
-        for _, members in itertools.groupby(todo, lambda run: (run[0].split, run[0].model)):
-            with stoppable(lambda: "every seed is saved") as reports:
-                train_together([*members], reports)
+    left: list[Path] = []
+    alike = (lambda run: (run[0].split, run[0].model)) if command.vmap_seeds else (lambda run: run)
+    for _, group in itertools.groupby(todo, alike):
+        members = [*group]
+        while members := [
+            (config, folder)
+            for config, folder in members
+            if folder not in left and sweep.progress(folder, config) != "finished"
+        ]:
+            try:
+                train_members(members, command.vmap_seeds, training.devices)
+                break
+            except BlockingIOError as held:
+                if held.filename not in [str(folder) for _, folder in members]:
+                    raise
+                left.append(Path(held.filename))
+                console.print(f"{held.filename}: another process trains it; skipped")
+    return left
+
+
+def train_members(
+    members: Sequence[tuple[TrainConfig, Path]], together: bool, device_count: int
+) -> None:
+    """Trains one run, or the seeds of one split and model together.
+
+    Raises:
+      BlockingIOError: another process trains one of them; the error names its folder.
+    """
+    from tdanet_jax.workflows.train import train, train_together
+
+    if together:
+        with stoppable(lambda: "every seed is saved") as reports:
+            train_together(members, reports)
         return
-    for config, folder in todo:
-        advice = functools.partial(how_to_continue, folder, config)
-        resume, count = (folder / CONFIG_FILE).exists(), training.devices
-        with stoppable(advice) as reports:
-            train(config, folder, resume=resume, device_count=count, callbacks=reports)
+    ((config, folder),) = members
+    resume = (folder / CONFIG_FILE).exists()
+    with stoppable(functools.partial(how_to_continue, folder, config)) as reports:
+        train(config, folder, resume=resume, device_count=device_count, callbacks=reports)
 
 
 @contextlib.contextmanager
@@ -181,18 +265,35 @@ def alone(out: Path) -> Iterator[None]:
         yield
 
 
-def write_report(out: Path, included: Sequence[FinishedRun]) -> None:
-    """Evaluates what is missing, and reports on the runs in `out` and on those included."""
+def write_report(
+    out: Path, included: Sequence[FinishedRun], left: Sequence[Path] = ()
+) -> list[Path]:
+    """Evaluates what is missing, and reports on the runs in `out` and on those included.
+
+    Args:
+      out: the folder of the sweep.
+      included: finished runs elsewhere.
+      left: runs that other processes train.
+
+    Returns:
+      The folders of the runs in `out` that are not finished.
+    """
     from tdanet_jax.analysis import figures
     from tdanet_jax.evaluation import report
     from tdanet_jax.tools import benchmarking
 
     if not (sweep.find(out) or included):
+        if left:
+            console.print(f"{out}: no finished run to report on yet")
+            return [*left]
         fail(f"{out}: no finished run")
     for folder in sweep.find_others(out):
         warnings.warn(f"{folder}: no run (it has no {CONFIG_FILE}); left out", stacklevel=2)
     with alone(out):
         runs = [*sweep.find(out), *included]  # another process may have finished some meanwhile
+        done = [run.folder for run in runs]
+        begun = dict.fromkeys([*left, *sweep.unfinished(out)])
+        unfinished = [folder for folder in begun if folder not in done]
         check_alike(runs)
         with reporter("histories") as show:
             for run, points in sweep.histories(runs, out):
@@ -206,6 +307,7 @@ def write_report(out: Path, included: Sequence[FinishedRun]) -> None:
             curves=curves,
             machine=benchmarking.processor(),
             code=report.code_version(),
+            unfinished=[folder.name for folder in unfinished],
         )
         names = {split: f"learning_curve-{file_name(split)}.png" for split in curves}
         for split, name in names.items():
@@ -214,6 +316,7 @@ def write_report(out: Path, included: Sequence[FinishedRun]) -> None:
         files.write_text(out / "report.json", content + "\n")
         files.write_text(out / "report.md", sweep_report.markdown(found, names))
     console.print(f"wrote {out / 'report.md'}")
+    return unfinished
 
 
 def check_alike(runs: Sequence[FinishedRun], planned: Sequence[Path] = ()) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -27,9 +27,20 @@ HISTORIES = "histories"
 
 
 def plan(
-    base: TrainConfig, splits: Sequence[str], models: Sequence[str], seeds: Sequence[int]
+    base: TrainConfig,
+    splits: Sequence[str],
+    models: Sequence[str],
+    seeds: Sequence[int],
+    per_model: Mapping[str, TrainConfig] | None = None,
 ) -> list[TrainConfig]:
     """The configurations of a sweep; the seeds of one split and model follow one another.
+
+    Args:
+      base: everything else of the runs.
+      splits: their splits.
+      models: their models.
+      seeds: their seeds.
+      per_model: what takes the place of `base` for some models.
 
     Raises:
       ValueError: a value is not allowed or given twice; the message names the flag.
@@ -40,8 +51,9 @@ def plan(
             raise ValueError(f"{flag}: give at least one")
         if len(set(given)) < len(given):
             raise ValueError(f"{flag}: a value is given twice")
+    own = per_model or {}
     out = [
-        dataclasses.replace(base, split=split, model=model, seed=seed)
+        dataclasses.replace(own.get(model, base), split=split, model=model, seed=seed)
         for split in splits
         for model in models
         for seed in seeds
@@ -111,6 +123,14 @@ def find(out: Path | str) -> list[FinishedRun]:
     """The finished runs in a sweep's folder, by name."""
     out = Path(out)
     return [finished(path) for path in _with_results(out) if (path / CONFIG_FILE).exists()]
+
+
+def unfinished(out: Path | str) -> list[Path]:
+    """The folders of runs in a sweep's folder that have begun and are not finished, by name."""
+    from tdanet_jax.evaluation.report import RESULTS_FILE
+
+    begun = (path.parent for path in sorted(Path(out).glob(f"*/{CONFIG_FILE}")))
+    return [folder for folder in begun if not (folder / RESULTS_FILE).exists()]
 
 
 def find_others(out: Path | str) -> list[Path]:

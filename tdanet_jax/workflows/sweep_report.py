@@ -38,6 +38,7 @@ class Report:
     curves: Mapping[str, Sequence[Curve]]  # by split
     machine: str  # where the costs were measured
     code: str  # the version of the code
+    unfinished: Sequence[str] = ()  # runs of the sweep that are left out, by name
 
     @property
     def splits(self) -> list[str]:
@@ -126,8 +127,12 @@ def _plain(value: Any) -> Any:
 
 
 def left_out(report: Report) -> list[str]:
-    """One line for each part of the paper's tables for which nothing was trained."""
+    """One line for each part of the paper's tables for which nothing was trained, and for runs and
+    curves that are missing.
+    """
     lines = []
+    if report.unfinished:
+        lines.append(f"Not finished: {', '.join(report.unfinished)}.")
     for split in PAPER_SPLITS:
         trained = {run.config.model for run in report.runs if run.results["split"] == split}
         absent = [model for model in MODELS if model not in trained]
@@ -166,6 +171,7 @@ def markdown(report: Report, figures: Mapping[str, str]) -> str:
         lines += _by_room(report, split)
     lines += _ablations(report)
     lines += _costs(report)
+    lines += _settings(report)
     lines += _runs(report)
     if absent := left_out(report):
         lines += ["", "## Left out", "", *(f"- {in_markdown(line)}" for line in absent)]
@@ -259,6 +265,25 @@ def _costs(report: Report) -> Iterator[str]:
     yield from ("", f"Time of one decision for a batch of agents, on {report.machine}.")
     yield "The paper's time is that of one decision on an NVIDIA GeForce RTX 3060."
     yield "The paper's word vectors have 300 dimensions; here, the input layers fit the run's."
+
+
+def _settings(report: Report) -> Iterator[str]:
+    """The flags in which the configurations differ, apart from the model and the split."""
+    named = zip(labels(report.runs), report.runs, strict=True)
+    settings = {label: run.results["settings"] for label, run in named}
+    names = dict.fromkeys(name for values in settings.values() for name in values)
+    differing = [
+        name
+        for name in names
+        if name not in ("--model", "--split")
+        and len({str(values.get(name)) for values in settings.values()}) > 1
+    ]
+    if differing:
+        yield from ("", "## Settings that differ", "")
+        yield from (f"| Model | {' | '.join(differing)} |", f"|{'---|' * (1 + len(differing))}")
+        for label, values in settings.items():
+            cells = [in_markdown(label), *(in_markdown(str(values.get(n))) for n in differing)]
+            yield f"| {' | '.join(cells)} |"
 
 
 def _runs(report: Report) -> Iterator[str]:

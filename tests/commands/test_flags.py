@@ -219,6 +219,7 @@ def prepare_sweep(recorder: Recorder) -> None:
     finished = SimpleNamespace(folder=Path("elsewhere"), results={"data_version": "d"})
     recorder.record("tdanet_jax.workflows.sweep.finished", gives=finished)
     recorder.record("tdanet_jax.training.devices.connect")
+    recorder.record("tdanet_jax.training.devices.check_divides")
     recorder.record("tdanet_jax.workflows.train.train", "tdanet_jax.workflows.train.train_together")
     recorder.record("tdanet_jax.commands.sweep.write_report")
 
@@ -387,6 +388,7 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--splits": "--splits 14/8",
             "--models": "--models ssnet",
             "--seeds": ("--out new --steps 1 --seeds 0", "--out new --steps 1 --seeds 1"),
+            "--per-model": "--per-model tdanet:--num-envs=8",
             "--vmap-seeds": "--vmap-seeds",
             "--report-only": ("--out new --steps 1", "--out new --report-only"),
             "--include": "--include elsewhere",

@@ -1,5 +1,6 @@
 """The sweep command, as a user types it."""
 
+import contextlib
 import dataclasses
 import json
 import random
@@ -11,7 +12,9 @@ import time
 
 import pytest
 
+from tdanet_jax import config as configs
 from tdanet_jax.commands import evaluate, sweep
+from tdanet_jax.config import LearnerConfig
 from tdanet_jax.io import files
 from tdanet_jax.workflows.sweep_report import Cost
 from tests.evaluation.test_comparison import result
@@ -44,6 +47,14 @@ RUN_FILES = {
             "which ssnet does not show",
         ),
         (["--out=x", "--models", "tdanet", "no.such"], "--model no.such: No module named 'no'"),
+        (["--out=x", "--per-model", "tdanet --gamma 1"], 'write "MODEL: FLAGS", in quotes'),
+        (["--out=x", "--per-model", "tdanett: --gamma 1"], "not one of --models; did you mean tda"),
+        (["--out=x", "--per-model", "tdanet:", "tdanet:"], "--per-model tdanet: is given twice"),
+        (["--out=x", "--per-model", "tdanet: --gama 1"], "tdanet: Unrecognized options: --gama, 1"),
+        (["--out=x", "--per-model", "tdanet: --gamma 2"], "--per-model tdanet: --gamma 2.0: must"),
+        (["--out=x", "--per-model", "tdanet: --gamma '1"], "--per-model tdanet: No closing quot"),
+        (["--out=x", "--per-model", "tdanet: --seed 1"], "tdanet: --seed: a sweep takes --seeds"),
+        (["--out=x", "--per-model", "tdanet: --no-validation"], "must be the same for all models"),
         (["--out=x", "--report-only", "--steps", "5"], "--report-only trains nothing"),
         (["--out=x", "--report-only"], "x: no finished run"),
         (["--out=x", "--report-only", "--include", "y"], "y/config.json: no such file"),
@@ -127,6 +138,96 @@ def test_what_cannot_stand_in_one_report_shows_before_anything_is_trained(tmp_pa
         sweep.main(["--seeds", "2", "--steps", "1", "--out", str(out), "--include", str(elsewhere)])
     assert "evaluated on other scene tables than" in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ["18-4-tdanet-seed1"]
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """What is trained without training: the folders, in order; the reports have made-up results."""
+    folders = []
+
+    def train(config, folder, **options):
+        with files.locked(folder):
+            folders.append(folder.name)
+            (folder / "config.json").write_text(json.dumps(configs.to_json(config)))
+            content = result(config.seed, model=config.model)
+            (folder / "results.json").write_text(json.dumps(content))
+
+    def train_together(members, reports):
+        with contextlib.ExitStack() as locks:
+            for _, folder in members:
+                locks.enter_context(files.locked(folder))
+        for member in members:
+            train(*member)
+
+    monkeypatch.setattr("tdanet_jax.workflows.train.train", train)
+    monkeypatch.setattr("tdanet_jax.workflows.train.train_together", train_together)
+    monkeypatch.setattr(sweep.sweep, "untrained", lambda runs, seed: [])
+    monkeypatch.setattr(sweep, "costs", lambda runs: {})
+    return folders
+
+
+@pytest.mark.parametrize("together", [[], ["--vmap-seeds"]])
+def test_a_run_of_another_process_is_left_to_it_and_the_sweep_goes_on(
+    tmp_path, capsys, trained, together
+):
+    out = tmp_path / "sweep"
+    arguments = ["--seeds", "0", "1", "2", "--steps", "1", "--out", str(out), *together]
+    with files.locked(out / "18-4-tdanet-seed1"):
+        with pytest.raises(SystemExit) as ended:
+            sweep.main(arguments)
+        assert ended.value.code == sweep.INCOMPLETE
+        assert trained == ["18-4-tdanet-seed0", "18-4-tdanet-seed2"]
+        said = capsys.readouterr().out
+        assert f"{out / '18-4-tdanet-seed1'}: another process trains it; skipped\n" in said
+        assert said.endswith(
+            "left to other processes: 18-4-tdanet-seed1\n"
+            "missing from the report, as not finished: 18-4-tdanet-seed1\n"
+        )
+        left_out = json.loads((out / "report.json").read_text())["left_out"]
+        assert "Not finished: 18-4-tdanet-seed1." in left_out
+    sweep.main(arguments)
+    assert trained[2:] == ["18-4-tdanet-seed1"]
+    left_out = json.loads((out / "report.json").read_text())["left_out"]
+    assert not any(line.startswith("Not finished") for line in left_out)
+
+
+def test_a_sweep_whose_runs_are_all_in_other_processes_says_so(tmp_path, capsys, trained):
+    with files.locked(tmp_path / "18-4-tdanet-seed0"), pytest.raises(SystemExit) as ended:
+        sweep.main(["--seeds", "0", "--steps", "1", "--out", str(tmp_path)])
+    assert ended.value.code == sweep.INCOMPLETE
+    assert "no finished run to report on yet" in capsys.readouterr().out
+
+
+def test_a_run_that_another_process_has_finished_meanwhile_is_not_trained_again(
+    tmp_path, monkeypatch, trained
+):
+    from tdanet_jax.workflows import train as workflow
+
+    train = workflow.train
+
+    def train_all_in_another_process(config, folder, **options):
+        for seed in (0, 1):
+            other = dataclasses.replace(config, seed=seed)
+            train(other, folder.parent / configs.run_name(other))
+
+    monkeypatch.setattr(workflow, "train", train_all_in_another_process)
+    sweep.main(["--seeds", "0", "1", "--steps", "1", "--out", str(tmp_path)])
+    assert trained == ["18-4-tdanet-seed0", "18-4-tdanet-seed1"]
+
+
+def test_a_sweep_continues_only_with_the_same_flags_of_each_model(tmp_path, capsys, trained):
+    arguments = ["--models", "tdanet", "savn", "--seeds", "0", "--steps", "9", "--out"]
+    own = ["--per-model", "savn: --num-envs 64 --learning-rate 1e-3"]
+    sweep.main([*arguments, str(tmp_path), *own])
+    used = configs.load(tmp_path / "18-4-savn-seed0" / "config.json").learner
+    assert (used.num_envs, used.learning_rate) == (64, 1e-3)
+    assert configs.load(tmp_path / "18-4-tdanet-seed0" / "config.json").learner == LearnerConfig()
+    sweep.main([*arguments, str(tmp_path), *own])
+    assert len(trained) == 2
+    with pytest.raises(SystemExit):
+        sweep.main([*arguments, str(tmp_path), "--per-model", "savn: --num-envs 64"])
+    said = capsys.readouterr().err
+    assert "18-4-savn-seed0: trained with other values of --learning-rate" in said
 
 
 def test_a_report_waits_for_one_in_another_process(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from tdanet_jax.config import NetworkConfig
+from tdanet_jax.config import LearnerConfig, NetworkConfig
 from tdanet_jax.evaluation.comparison import curve
 from tdanet_jax.registry import MODELS
 from tdanet_jax.workflows import sweep, sweep_report
@@ -66,6 +66,26 @@ def test_runs_of_other_flags_are_apart(tmp_path):
     assert "| tdanet, --width 16 | 3,145,728 | 3.00 | 3.08 |" in page
     assert "Split 18/4: not trained: tdanet-no-ta, " in page
     assert list(report.results("18/4")) == ["random", *dict.fromkeys(found)]
+
+
+def test_what_each_model_was_trained_with_is_told_where_it_differs(tmp_path, report):
+    own = dataclasses.replace(BASE, model="savn", learner=LearnerConfig(num_envs=64))
+    run = sweep.finished(made(tmp_path, own, result(model="savn")))
+    assert "Settings that differ" not in sweep_report.markdown(report, {})
+    costs = {**report.costs, "savn": Cost("savn", 1000, {1: 1.0, 1024: 2.0})}
+    report = dataclasses.replace(report, runs=[*report.runs, run], costs=costs)
+    page = sweep_report.markdown(report, {})
+    table = page[page.index("| Model | --num-envs |") :].splitlines()
+    assert table[2:6] == ["| tdanet | 256 |", "| tdanet-no-ta | 256 |", "| savn | 64 |", ""]
+    used = {
+        run["model"]: run["settings"]["--num-envs"] for run in sweep_report.to_json(report)["runs"]
+    }
+    assert used == {"tdanet": 256, "tdanet-no-ta": 256, "savn": 64}
+
+
+def test_runs_that_are_not_finished_are_named(report):
+    report = dataclasses.replace(report, unfinished=["18-4-savn-seed0"])
+    assert "Not finished: 18-4-savn-seed0." in sweep_report.left_out(report)
 
 
 def test_there_is_a_curve_for_every_configuration(tmp_path, monkeypatch):
