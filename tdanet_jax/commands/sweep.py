@@ -20,8 +20,9 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -40,6 +41,7 @@ from tdanet_jax.commands.streams import output_may_break
 from tdanet_jax.config import CONFIG_FILE, OWN_TASK, TrainConfig, run_name
 from tdanet_jax.io import files
 from tdanet_jax.splits import file_name
+from tdanet_jax.training import cluster
 from tdanet_jax.workflows import sweep, sweep_report
 from tdanet_jax.workflows.sweep import FinishedRun
 from tdanet_jax.workflows.sweep_report import Cost
@@ -83,6 +85,10 @@ class Command:
     vmap_seeds: bool = False
     """Train the seeds of a split and model in one vmapped call; needs a budget in steps. For
     accelerators: on a CPU it is slower than one seed after the other, unless networks are small."""
+    shard: str | None = None
+    """I/N: train the I-th of N shares of the runs, I from 1, and write no report. For several
+    machines, which need not share a folder; --report-only then reports on all runs in one folder
+    (docs/cluster.md)."""
     report_only: bool = False
     """Train nothing; report on the finished runs in --out and on --include."""
     include: tuple[Path, ...] = ()
@@ -107,12 +113,15 @@ def main(arguments: list[str] | None = None) -> None:
         training = parse_command(rest)
         base, per_model = training.run.normalised(), parse_per_model(command, rest)
         configs = sweep.plan(base, command.splits, command.models, command.seeds, per_model)
+        configs = share(command, configs)
         if command.vmap_seeds and any({*config.budget} - {"steps"} for config in configs):
             fail("--vmap-seeds needs a budget in --steps: all seeds must end together")
         if command.vmap_seeds and training.devices > 1:
             fail("--vmap-seeds and --devices: choose one")
-        if os.environ.get("JAX_COORDINATOR_ADDRESS"):
-            fail("a sweep is one process; JAX_COORDINATOR_ADDRESS is set")
+        if os.environ.get(cluster.ADDRESS):
+            fail(f"a sweep is one process; {cluster.ADDRESS} is set")
+        if cluster.several() and not command.shard and not command.report_only:
+            fail("a sweep is one process, and several were started: give each its --shard")
         check_positive(devices=training.devices)
         included = [sweep.finished(folder) for folder in command.include]
         planned = [] if command.report_only else [command.out / run_name(c) for c in configs]
@@ -121,6 +130,26 @@ def main(arguments: list[str] | None = None) -> None:
         check_folder(command.out)
         with output_may_break():
             run(command, training, configs, included)
+
+
+def share(command: Command, configs: Sequence[TrainConfig]) -> list[TrainConfig]:
+    """The runs of `--shard`; seeds that are trained together stay together."""
+    if command.shard is None:
+        return [*configs]
+    if command.report_only:
+        fail("--shard: --report-only trains nothing, and reports on all runs")
+    number, _, count = command.shard.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        fail(f"--shard {command.shard}: must be I/N, I from 1 to N")
+    groups = [[*group] for _, group in itertools.groupby(configs, alike(command))]
+    return [*itertools.chain(*groups[int(number) - 1 :: int(count)])]
+
+
+def alike(command: Command) -> Callable[[TrainConfig], Any]:
+    """The key of runs that are trained in one call, which follow one another."""
+    if command.vmap_seeds:
+        return lambda config: (config.split, config.model)
+    return lambda config: config
 
 
 def check_own(words: Sequence[str], where: str = "") -> None:
@@ -171,8 +200,10 @@ def run(
     """Trains and reports; says how to continue if a signal stops it."""
     try:
         left = [] if command.report_only else train_all(command, training, configs)
-        with stoppable(lambda: "finished evaluations are kept"):
-            unfinished = write_report(command.out, included, left)
+        unfinished: Collection[Path] = left
+        if command.shard is None:
+            with stoppable(lambda: "finished evaluations are kept"):
+                unfinished = write_report(command.out, included, left)
     except SystemExit as stop:
         if isinstance(stop.code, int) and stop.code > SIGNALLED:
             console.print("run the same command again to continue the sweep")
@@ -180,8 +211,11 @@ def run(
     if left:
         console.print(f"left to other processes: {', '.join(folder.name for folder in left)}")
     if missing := [folder.name for folder in left if folder in unfinished]:
-        console.print(f"missing from the report, as not finished: {', '.join(missing)}")
+        console.print(f"not finished, and so in no report: {', '.join(missing)}")
         raise SystemExit(INCOMPLETE)
+    if command.shard is not None:
+        console.print("when all shares are done:")
+        console.print(f"tdanet sweep --out {shlex.quote(str(command.out))} --report-only")
 
 
 def train_all(
@@ -202,6 +236,7 @@ def train_all(
     from tdanet_jax.task import resolve
     from tdanet_jax.training import devices
 
+    cluster.leave()  # each share has runs of its own
     mesh = devices.connect(training.devices)
     devices.keep_compiled()
     todo = []
@@ -214,8 +249,8 @@ def train_all(
             todo.append((config, folder))
     console.print(f"{len(configs)} runs, {len(configs) - len(todo)} finished, {len(todo)} to train")
     left: list[Path] = []
-    alike = (lambda run: (run[0].split, run[0].model)) if command.vmap_seeds else (lambda run: run)
-    for _, group in itertools.groupby(todo, alike):
+    key = alike(command)
+    for _, group in itertools.groupby(todo, lambda run: key(run[0])):
         members = [*group]
         while members := [
             (config, folder)

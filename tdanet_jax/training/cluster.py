@@ -22,3 +22,9 @@ def launcher() -> str | None:
 def several() -> bool:
     """Whether this process is one of several."""
     return bool(os.environ.get(ADDRESS)) or launcher() is not None
+
+
+def leave() -> None:
+    """Makes this process one by itself, whichever others a launcher has started."""
+    for variable in LAUNCHERS.values():
+        os.environ.pop(variable, None)

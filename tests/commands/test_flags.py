@@ -390,6 +390,10 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--seeds": ("--out new --steps 1 --seeds 0", "--out new --steps 1 --seeds 1"),
             "--per-model": "--per-model tdanet:--num-envs=8",
             "--vmap-seeds": "--vmap-seeds",
+            "--shard": (
+                "--out new --steps 1 --seeds 0 1",
+                "--out new --steps 1 --seeds 0 1 --shard 1/2",
+            ),
             "--report-only": ("--out new --steps 1", "--out new --report-only"),
             "--include": "--include elsewhere",
         },

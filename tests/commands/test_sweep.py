@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -55,6 +56,10 @@ RUN_FILES = {
         (["--out=x", "--per-model", "tdanet: --gamma '1"], "--per-model tdanet: No closing quot"),
         (["--out=x", "--per-model", "tdanet: --seed 1"], "tdanet: --seed: a sweep takes --seeds"),
         (["--out=x", "--per-model", "tdanet: --no-validation"], "must be the same for all models"),
+        (["--out=x", "--shard", "3/2"], "--shard 3/2: must be I/N, I from 1 to N"),
+        (["--out=x", "--shard", "0/2"], "--shard 0/2: must be I/N, I from 1 to N"),
+        (["--out=x", "--shard", "2"], "--shard 2: must be I/N, I from 1 to N"),
+        (["--out=x", "--report-only", "--shard", "1/2"], "--shard: --report-only trains nothing"),
         (["--out=x", "--report-only", "--steps", "5"], "--report-only trains nothing"),
         (["--out=x", "--report-only"], "x: no finished run"),
         (["--out=x", "--report-only", "--include", "y"], "y/config.json: no such file"),
@@ -140,6 +145,22 @@ def test_what_cannot_stand_in_one_report_shows_before_anything_is_trained(tmp_pa
     assert [path.name for path in out.iterdir()] == ["18-4-tdanet-seed1"]
 
 
+@pytest.mark.parametrize(
+    ("variable", "message"),
+    [
+        ("JAX_COORDINATOR_ADDRESS", "a sweep is one process; JAX_COORDINATOR_ADDRESS is set"),
+        ("SLURM_STEP_NUM_TASKS", "several were started: give each its --shard"),
+    ],
+)
+def test_several_processes_without_shares_are_refused(
+    tmp_path, monkeypatch, capsys, variable, message
+):
+    monkeypatch.setenv(variable, "2")
+    with pytest.raises(SystemExit):
+        sweep.main(["--steps", "1", "--out", str(tmp_path / "sweep")])
+    assert message in capsys.readouterr().err
+
+
 @pytest.fixture
 def trained(monkeypatch):
     """What is trained without training: the folders, in order; the reports have made-up results."""
@@ -167,6 +188,27 @@ def trained(monkeypatch):
 
 
 @pytest.mark.parametrize("together", [[], ["--vmap-seeds"]])
+def test_shares_train_every_run_once_in_folders_that_are_merged(
+    tmp_path, monkeypatch, capsys, trained, together
+):
+    models = ("tdanet", "tdanet-no-ta", "ssnet")
+    arguments = ["--models", *models, "--seeds", "0", "1", "--steps", "1", *together]
+    for shard in ("1/2", "2/2"):
+        monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "2")  # no process joins the other
+        out = tmp_path / shard.replace("/", " of ")
+        sweep.main([*arguments, "--shard", shard, "--out", str(out)])
+        assert f"tdanet sweep --out '{out}' --report-only" in capsys.readouterr().out
+        assert not (out / "report.json").exists()
+        shutil.copytree(out, tmp_path / "all", dirs_exist_ok=True)
+    runs = [f"18-4-{model}-seed{seed}" for model in models for seed in (0, 1)]
+    first = [*runs[:2], *runs[4:]] if together else runs[::2]  # seeds that train together
+    assert trained == [*first, *sorted(set(runs) - set(first), key=runs.index)]
+    sweep.main(["--report-only", "--out", str(tmp_path / "all")])
+    comparison = json.loads((tmp_path / "all" / "report.json").read_text())["comparison"]
+    assert {*comparison["18/4"]} == {*models}
+
+
+@pytest.mark.parametrize("together", [[], ["--vmap-seeds"]])
 def test_a_run_of_another_process_is_left_to_it_and_the_sweep_goes_on(
     tmp_path, capsys, trained, together
 ):
@@ -181,7 +223,7 @@ def test_a_run_of_another_process_is_left_to_it_and_the_sweep_goes_on(
         assert f"{out / '18-4-tdanet-seed1'}: another process trains it; skipped\n" in said
         assert said.endswith(
             "left to other processes: 18-4-tdanet-seed1\n"
-            "missing from the report, as not finished: 18-4-tdanet-seed1\n"
+            "not finished, and so in no report: 18-4-tdanet-seed1\n"
         )
         left_out = json.loads((out / "report.json").read_text())["left_out"]
         assert "Not finished: 18-4-tdanet-seed1." in left_out

@@ -167,6 +167,10 @@ def test_a_launcher_says_who_is_who(monkeypatch):
                 devices.connect()
             assert heard == [{"cluster_detection_method": name}] * several
         heard.clear()
+    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "2")
+    cluster.leave()
+    devices.connect()
+    assert heard == []
     monkeypatch.setenv("SLURM_NTASKS", "2")  # a job script, which is one process
     assert not cluster.several()
 
