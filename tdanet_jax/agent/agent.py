@@ -79,6 +79,7 @@ class Agent(BaseAgent):
         self.weights = weights
         self._table: Any = None
         self._table_rows = 0
+        self._begin = jax.jit(self._first)
         self._decide = jax.jit(self._forward)
         self._decide_many = jax.jit(jax.vmap(self._forward, (None, None, 0, 0, 0, 0)))
 
@@ -96,13 +97,9 @@ class Agent(BaseAgent):
           ValueError: the grid has no such rotation or horizon.
         """
         turn, down = self.grid.nearest_view(rotation, horizon)
-        start = Start(jnp.int32(turn), jnp.int32(down), NO_SLIP if measured else None)
-        return AgentState(
-            recurrent=actor_critic.initial_state(self.model, self.weights, 1),
-            action=jnp.int32(NUM_ACTIONS),
-            sensors=suite.init(self.spec, start),
-            target=jnp.int32(-1),
-        )
+        start = Start(jnp.asarray(turn), jnp.asarray(down), NO_SLIP if measured else None)
+        state: AgentState = self._begin(self.weights, start)
+        return state
 
     def act(
         self,
@@ -143,7 +140,7 @@ class Agent(BaseAgent):
         self._checked(state, blocked, pose, forbidden)
         obs, owner = self._observe(detections, target)
         state, out, attention = self._decide(
-            self.weights, self._prepared(), state, obs, jnp.asarray(bool(blocked)), pose
+            self.weights, self._prepared(), state, obs, np.bool_(blocked), pose
         )
         return _decision(state, out, attention, owner, key, forbidden)
 
@@ -247,14 +244,14 @@ class Agent(BaseAgent):
         classes = np.zeros((1, rows), np.int32)
         boxes = np.zeros((1, rows, found.shape[1]), np.float32)
         classes[0, :count], boxes[0, :count] = labels, found
-        observation = Observation(
-            classes=jnp.asarray(classes),
-            boxes=jnp.asarray(boxes),
-            mask=jnp.arange(rows)[None] < count,
-            target=jnp.full(1, self._index(target), jnp.int32),
-            empty=jnp.full(1, not detections),
-        )
-        return observation, owner
+        arrays: dict[str, Any] = {  # of NumPy: the compiled step takes them sooner than JAX's
+            "classes": classes,
+            "boxes": boxes,
+            "mask": np.arange(rows)[None] < count,
+            "target": np.full(1, self._index(target), np.int32),
+            "empty": np.full(1, not detections),
+        }
+        return Observation(**arrays), owner
 
     def _prepared(self) -> Any:
         if self._table is None or self._table_rows != len(self._rows):
@@ -262,9 +259,16 @@ class Agent(BaseAgent):
             names = [" ".join(key) for key in self._rows]
             table = self._vectors.table(names, self.config.network.word_norm)
             rest = -len(table) % LABEL_BLOCK
-            padded = jnp.asarray(np.pad(table, ((0, rest), (0, 0))))
-            self._table = actor_critic.prepare(self.model, self.weights, padded)
+            self._table = _prepare(self.model, self.weights, np.pad(table, ((0, rest), (0, 0))))
         return self._table
+
+    def _first(self, weights: Any, start: Start) -> AgentState:
+        return AgentState(
+            recurrent=actor_critic.initial_state(self.model, weights, 1),
+            action=jnp.int32(NUM_ACTIONS),
+            sensors=suite.init(self.spec, start),
+            target=jnp.int32(-1),
+        )
 
     def _forward(
         self,
@@ -290,6 +294,10 @@ class Agent(BaseAgent):
         return AgentState(recurrent, state.action, sensors, frame.target), out, attention
 
 
+_prepare = jax.jit(actor_critic.prepare, static_argnums=0)
+_sample = jax.jit(jax.random.categorical)
+
+
 def _decision(
     state: AgentState,
     out: Output,
@@ -299,18 +307,23 @@ def _decision(
     forbidden: Collection[Action],
 ) -> tuple[AgentState, Decision]:
     """The state after a step, and the decision, from what `Agent._forward` gives."""
-    logits, probabilities = jnp.asarray(out.logits[0]), state.recurrent.prev_action_probs[0]
+    # In NumPy: each single operation of JAX would be compiled, and take longer than the network.
+    logits = np.asarray(out.logits)[0]
+    probabilities = np.asarray(state.recurrent.prev_action_probs)[0]
     if forbidden:
-        logits = logits.at[np.array([*forbidden])].set(-jnp.inf)
-        probabilities = jax.nn.softmax(logits)
-    action = jnp.argmax(logits) if key is None else jax.random.categorical(key, logits)
+        logits = np.array(logits)
+        logits[[*forbidden]] = -np.inf
+        probabilities = np.exp(logits - logits.max())
+        probabilities /= probabilities.sum()
+    action = Action(int(np.argmax(logits) if key is None else _sample(key, logits)))
     decision = Decision(
-        action=Action(int(action)),
-        probabilities=np.asarray(probabilities),
-        value=float(out.value[0]),
-        attention=None if attention is None else np.asarray(attention[0])[owner],
+        action=action,
+        probabilities=probabilities,
+        value=float(np.asarray(out.value)[0]),
+        attention=None if attention is None else np.asarray(attention)[0][owner],
     )
-    return state._replace(action=action.astype(jnp.int32)), decision
+    taken: Any = np.int32(action)
+    return state._replace(action=taken), decision
 
 
 def load(
