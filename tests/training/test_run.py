@@ -238,9 +238,10 @@ def test_a_checkpoint_of_another_network_is_refused(whole, task):
         Run(whole[0], wider, other)
 
 
-def test_a_run_of_the_first_version_goes_on(ithor, tmp_path):
+@pytest.mark.parametrize("name", ["run_format_1", "run_format_2"])
+def test_a_run_of_an_old_version_goes_on(ithor, tmp_path, name):
     """Its state lacks what was added since; all that was in it is still there."""
-    folder = shutil.copytree(OLD_RUN, tmp_path / "run")
+    folder = shutil.copytree(OLD_RUN.parent / name, tmp_path / "run")
     config = configs.load(folder / "config.json")
     read = newest(folder)
     tables = samples.as_version(ithor, read.data_version)  # the rooms have changed since
@@ -249,6 +250,12 @@ def test_a_run_of_the_first_version_goes_on(ithor, tmp_path):
     chex.assert_trees_all_equal(run.state.params, read.weights)
     moments = jax.tree.leaves(run.state.opt_state)
     assert any(np.asarray(leaf).any() for leaf in moments)
+    run._saved = None
+    run.save()  # in the format of today, in place of the old one
+    assert not list(folder.rglob("meta/metadata"))
+    again = Run(folder, config, run.task)
+    for ours, theirs in zip(leaves(again.state), leaves(run.state), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
 
 
 def test_a_checkpoint_of_other_tables_is_refused(whole, task, ithor):
