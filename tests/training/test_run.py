@@ -238,7 +238,9 @@ def test_a_checkpoint_of_another_network_is_refused(whole, task):
         Run(whole[0], wider, other)
 
 
-@pytest.mark.parametrize("name", ["run_format_1", "run_format_2"])
+@pytest.mark.parametrize(
+    "name", ["run_format_2", pytest.param("run_format_1", marks=pytest.mark.slow)]
+)
 def test_a_run_of_an_old_version_goes_on(ithor, tmp_path, name):
     """Its state lacks what was added since; all that was in it is still there."""
     folder = shutil.copytree(OLD_RUN.parent / name, tmp_path / "run")

@@ -66,7 +66,7 @@ def as_npz(folder: Path) -> Iterator[Path]:
             raise FileError(folder, reason or f"crashed its reader (status {done.returncode})")
         try:
             yield out
-        except FileError as error:  # nobody knows the file that it names
+        except FileError as error:  # the file that it names will be gone
             raise FileError(folder, str(error).removeprefix(f"{out}: ")) from None
 
 
