@@ -1,32 +1,26 @@
-"""Checkpoints of a run (Orbax): everything that is needed to continue bit for bit.
+"""Checkpoints of a run: everything that is needed to continue bit for bit.
 
-`DIR/checkpoints/<updates>/` holds `state` (parameters, optimiser, episodes in progress, recurrent
-state, random key, counters; plain arrays, whichever devices held them), `meta` (JSON: format
-version, training time, data version) and `SHA256SUMS`, the checksums of all its files
-(`sha256sum -c SHA256SUMS` checks them, too).
+`DIR/checkpoints/<updates>/` holds `state.npz` (parameters, optimiser, episodes in progress,
+recurrent state, random key, counters: plain arrays, whichever devices held them, by their paths in
+the state, such as `params/actor/kernel`), `meta.json` (format version, training time, data version)
+and `SHA256SUMS`, the checksums of both (`sha256sum -c SHA256SUMS` checks them, too).
 """
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import logging
+import json
 import os
 import shutil
-import sys
-import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import numpy as np
-import orbax.checkpoint as ocp
 
 from tdanet_jax.io import assets, files
-from tdanet_jax.io.untrusted import FileError, jsons, orbax, regular
-from tdanet_jax.io.untrusted.budgets import unpacking_excess
+from tdanet_jax.io.untrusted import FileError, jsons, npz, orbax, regular
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
 from tdanet_jax.training.renames import renamed
@@ -34,14 +28,17 @@ from tdanet_jax.training.renames import renamed
 if TYPE_CHECKING:
     from tdanet_jax.training.learner import TrainState
 
+T = TypeVar("T")
+
 #: Version of the files' layout; a newer one is refused, an older one renamed (`renames`).
-FORMAT = 2
+FORMAT = 3
+#: The last version that Orbax wrote: folders `state` and `meta`.
+LAST_OF_ORBAX = 2
 FOLDER = "checkpoints"
+ARRAYS = "state.npz"
+META = "meta.json"
 CHECKSUMS = "SHA256SUMS"
 KEPT = 2
-
-# Orbax logs every file it touches, and every error that it also raises.
-logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 class NewerFormat(ValueError):
@@ -72,21 +69,9 @@ class Checkpoints:
     """The checkpoints of one run's folder."""
 
     def __init__(self, run: Path | str) -> None:
-        run = Path(run)
-        self.folder = (run / FOLDER).absolute()
-        # Every process reads for itself, and one alone writes: none waits for the others.
-        here = jax.process_index()
-        alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
-        self._orbax = ocp.Checkpointer(
-            ocp.CompositeCheckpointHandler(
-                composite_options=ocp.CompositeOptions(multiprocessing_options=alone),
-                state=ocp.StandardCheckpointHandler(multiprocessing_options=alone),
-                meta=ocp.JsonCheckpointHandler(multiprocessing_options=alone),
-            ),
-            multiprocessing_options=alone,
-        )
+        self.folder = (Path(run) / FOLDER).absolute()
 
-    def save(self, state: TrainState, meta: dict[str, Any]) -> None:
+    def save(self, state: TrainState, meta: Mapping[str, Any]) -> None:
         """Writes a checkpoint; it appears complete or not at all. The newest two are kept.
 
         Raises:
@@ -94,34 +79,29 @@ class Checkpoints:
         """
         updates = int(state.updates)
         path = self.folder / str(updates)
+        arrays = _named(jax.device_get(_plain(state)))
+        for name, array in arrays.items():
+            if array.dtype.isbuiltin != 1:
+                raise ValueError(f"{path}: {name} is {array.dtype}, which npz cannot hold")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            content = jax.device_get(_plain(state))
-            _check_space(self.folder, content)
-            with files.private_folder(self.folder) as partial, _quiet_threads():
+            with files.private_folder(self.folder) as partial:
                 fresh = partial / path.name
-                self._orbax.save(
-                    fresh,
-                    args=ocp.args.Composite(
-                        state=ocp.args.StandardSave(content),
-                        meta=ocp.args.JsonSave({**meta, "format": FORMAT}),
-                    ),
-                )
+                fresh.mkdir()
+                np.savez(fresh / ARRAYS, **arrays)
+                (fresh / META).write_text(json.dumps({**meta, "format": FORMAT}))
                 sums = "".join(f"{sha}  {name}\n" for name, sha in _checksums(fresh).items())
                 (fresh / CHECKSUMS).write_text(sums)
                 shutil.rmtree(path, ignore_errors=True)  # only a damaged one can be there
                 fresh.rename(path)
-        except Exception as error:  # Orbax and TensorStore raise many kinds, for a full disk too
-            with contextlib.suppress(OSError):  # its threads may still write into it
-                files.remove_partial(self.folder)
+        except OSError as error:
             kept = f"the one before it is {self.latest()}" if self._steps() else "there is no other"
-            reason = f"checkpoint not written ({_reason(error)}); {kept}"
+            reason = f"checkpoint not written ({error.strerror or error}); {kept}"
             raise ValueError(f"{path}: {reason}") from error
         # A later one is damaged: the run has continued from an earlier one instead.
         keep = [step for step in self._steps() if step <= updates][:KEPT]
         for step in set(self._steps()) - set(keep):
             shutil.rmtree(self.folder / str(step))
-        _give_memory_back()
 
     def latest(self) -> int | None:
         """The number of updates of the newest complete checkpoint."""
@@ -136,9 +116,8 @@ class Checkpoints:
         Raises:
           ValueError: there is no checkpoint, or none that fits this configuration.
         """
-        shapes = jax.eval_shape(_plain, jax.eval_shape(make_state))
-        blank = jax.tree.map(lambda x: np.empty(x.shape, x.dtype), shapes)
-        state, meta = self._read(blank)
+        blank = jax.eval_shape(_plain, jax.eval_shape(make_state))
+        state, meta = self._read(lambda path, written, meta: (_state(path, written, blank), meta))
         return state.replace(key=jax.random.wrap_key_data(state.key)), meta
 
     def snapshot(self) -> Snapshot:
@@ -147,7 +126,7 @@ class Checkpoints:
         Raises:
           ValueError: there is no checkpoint, or none can be read.
         """
-        return self._read(None)
+        return self._read(_snapshot)
 
     def _steps(self) -> list[int]:
         """The complete checkpoints, newest first."""
@@ -156,13 +135,12 @@ class Checkpoints:
         found = (int(name) for name in names if name.isdecimal() and str(int(name)) == name)
         return sorted(found, reverse=True)
 
-    def _read(self, blank: Any) -> Any:
+    def _read(self, read: Callable[[Path, int, dict[str, Any]], T]) -> T:
+        """What `read` makes of the newest checkpoint that it can read."""
         faults: list[Exception] = []
         for step in self._steps():
-            path = self.folder / str(step)
             try:
-                read = self._read_one(path, blank)
-                found = _snapshot(path, *read) if blank is None else read
+                found = _read_one(self.folder / str(step), read)
             except NewerFormat:
                 raise  # it is sound: no older one may replace it
             except (ValueError, OSError) as error:
@@ -173,122 +151,92 @@ class Checkpoints:
             return found
         raise faults[0] if faults else ValueError(f"{self.folder}: no checkpoint")
 
-    def _read_one(self, path: Path, blank: Any) -> tuple[Any, dict[str, Any]]:
-        size = regular.check_tree(path)
-        _verify(path)
-        try:
-            meta = jsons.load(path / "meta" / "metadata", links=False)
-            written = meta["format"]
-            if written <= FORMAT:
-                described = renamed(orbax.describe(path / "state"), written)
-                if blank is None:
-                    described = {n: one for n, one in described.items() if _is_of_network(n)}
-                    _check_budgets(described, size)
-                else:
-                    _fitted(described, blank)  # its shapes, before anything is read
-                found = {name: one.read() for name, one in described.items()}
-                state = history.nested(path, found) if blank is None else _fitted(found, blank)
-        except Exception as error:  # a damaged folder has many kinds of faults
-            raise ValueError(f"{path}: unreadable checkpoint ({_reason(error)})") from error
-        if written > FORMAT:
-            raise NewerFormat(
-                f"{path}: checkpoint of format {written}, this version reads up to {FORMAT}: "
-                "a newer tdanet_jax wrote it"
-            )
-        return state, meta
 
-
-def _is_of_network(name: str) -> bool:
-    """Whether an array of a state is needed for the network alone."""
-    return name.startswith("params/") or name in ("updates", "episodes")
-
-
-def _snapshot(path: Path, state: Any, meta: Mapping[str, Any]) -> Snapshot:
-    """The network and the progress in a checkpoint."""
-    counts = {name: state.get(name) for name in ("updates", "episodes")}
-    if any(getattr(count, "shape", None) != () for count in counts.values()):
-        raise FileError(path, "has no updates or episodes")
-    weights = state.get("params")
-    if not isinstance(weights, dict):
-        raise FileError(path, "has no params")
-    return history.snapshot(
-        path,
-        weights,
-        point=0,
-        **{name: count.item() for name, count in counts.items()},
-        **{name: meta.get(name) for name in ("seconds", "data_version")},
+def _read_one(path: Path, read: Callable[[Path, int, dict[str, Any]], T]) -> T:
+    """What `read` makes of a checkpoint, given its arrays, its format and its meta."""
+    regular.check_tree(path)
+    _verify(path)
+    try:
+        file = path / "meta" / "metadata" if (path / "meta").is_dir() else path / META
+        meta = jsons.load(file, links=False)
+        if not isinstance(meta, dict):
+            raise FileError(file, "not a JSON object")
+        written = int(jsons.number(file, meta.get("format"), "format", 1e9))
+        if written <= FORMAT:
+            where = {name: meta.get(name) for name in ("seconds", "data_version")}
+            history.check_progress(file, where)
+            if written > LAST_OF_ORBAX:
+                return read(path / ARRAYS, written, meta)
+            with orbax.as_npz(path / "state") as arrays:
+                return read(arrays, written, meta)
+    except (ValueError, OSError) as error:
+        reason = str(error).removeprefix(f"{path}/").removeprefix(f"{path}: ")
+        raise ValueError(f"{path}: unreadable checkpoint ({reason})") from error
+    raise NewerFormat(
+        f"{path}: checkpoint of format {written}, this version reads up to {FORMAT}: "
+        "a newer tdanet_jax wrote it"
     )
 
 
-def _check_budgets(described: Mapping[str, orbax.Stored], size: int) -> None:
-    """Raises ValueError if arrays are too many or too large to be read.
-
-    Args:
-      size: bytes of the checkpoint's files.
-    """
-    unpacked = sum(one.size for one in described.values())
-    if reason := unpacking_excess(len(described), unpacked, size):
-        raise ValueError(reason)
-
-
-def _fitted(found: Mapping[str, Any], blank: Any) -> Any:
-    """The tree of `blank` with the leaves that have the same names.
+def _state(arrays: Path, written: int, blank: TrainState) -> TrainState:
+    """The tree of `blank` with the arrays that have the same names.
 
     By name, because a later version of the state may have further parts that are None here, which
     the files of an earlier one do not mention.
 
     Raises:
-      ValueError: names, shapes or types differ.
+      FileError: names, shapes or types differ; no array has been read then.
     """
-    wanted = {_name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(blank)}
-    for name in sorted(found.keys() ^ wanted.keys()):
-        raise ValueError(f"{name} is {'missing' if name in wanted else 'of no use here'}")
-    for name, leaf in wanted.items():
-        one, other = (f"{x.dtype}{x.shape}" for x in (found[name], leaf))
-        if one != other:
-            raise ValueError(f"{name} is {one}, not {other}")
+    wanted = _named(blank)
+
+    def check(found: Mapping[str, npz.Header]) -> None:
+        found = renamed(found, written)
+        for name in sorted(found.keys() ^ wanted.keys()):
+            reason = f"{name} is {'missing' if name in wanted else 'of no use here'}"
+            raise FileError(arrays, reason)
+        for name, leaf in wanted.items():
+            one, other = (f"{x.dtype}{x.shape}" for x in (found[name], leaf))
+            if one != other:
+                raise FileError(arrays, f"{name} is {one}, not {other}")
+
+    found = renamed(npz.read(arrays, links=False, check=check), written)
     return jax.tree.unflatten(jax.tree.structure(blank), [found[name] for name in wanted])
 
 
-def _name(path: tuple[Any, ...]) -> str:
-    """params/actor/kernel, whether the parts are fields, keys or places."""
-    return jax.tree_util.keystr(path, simple=True, separator="/")
+def _snapshot(arrays: Path, written: int, meta: Mapping[str, Any]) -> Snapshot:
+    """The network and the progress in a checkpoint.
+
+    Raises:
+      FileError: one of them is not there, or not what it must be.
+    """
+    prefix, counters = "params/", ("updates", "episodes")
+
+    def is_needed(name: str) -> bool:
+        return name.startswith(prefix) or name in counters
+
+    found = npz.read(arrays, links=False, only=is_needed)
+    counts = {name: found.pop(name, None) for name in counters}
+    if not found:
+        raise FileError(arrays, "has no params")
+    weights = {name.removeprefix(prefix): x for name, x in renamed(found, written).items()}
+    return history.snapshot(
+        arrays,
+        history.weights(arrays, weights),
+        point=0,
+        **{name: x.item() if x is not None and x.shape == () else x for name, x in counts.items()},
+        **{name: meta[name] for name in ("seconds", "data_version")},
+    )
 
 
-@contextlib.contextmanager
-def _quiet_threads() -> Iterator[None]:
-    """Keeps Orbax's threads from printing the errors that they also hand to the caller."""
-    before = threading.excepthook, sys.unraisablehook
-    threading.excepthook, sys.unraisablehook = lambda error: None, lambda error: None
-    try:
-        yield
-    finally:
-        threading.excepthook, sys.unraisablehook = before
-
-
-def _give_memory_back() -> None:
-    """Returns freed memory to the system. Each thread that writes would keep some (glibc)."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
-
-
-def _check_space(folder: Path, content: Any) -> None:
-    """Raises OSError if the disk cannot hold a state. Orbax would only find out half-way."""
-    needed = sum(array.nbytes for array in jax.tree.leaves(content))
-    free = shutil.disk_usage(folder).free
-    if free < needed:
-        megabytes = f"{needed / 1e6:.1f} MB needed, {free / 1e6:.1f} MB free"
-        raise OSError(f"No space left on device: {megabytes}")
+def _named(state: TrainState) -> dict[str, Any]:
+    """The arrays of a state by name, params/actor/kernel: of fields, keys and places."""
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 def _plain(state: TrainState) -> TrainState:
     """The state with its random key as integers, which is what a file can hold."""
     return state.replace(key=jax.random.key_data(state.key))
-
-
-def _reason(error: Exception) -> str:
-    """The first line of an error's message."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def _checksums(folder: Path) -> dict[str, str]:

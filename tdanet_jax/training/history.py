@@ -106,24 +106,22 @@ def read(path: Path | str) -> Snapshot:
         raise FileError(
             path, f"format {written}, this version reads {FORMAT}: a newer tdanet_jax wrote it"
         )
-    for name, array in content.items():
-        if array.dtype.kind != "f":
-            raise FileError(path, f"{name} is not a parameter")
-    content = {name: array.astype(np.float32) for name, array in content.items()}
-    return snapshot(path, nested(path, renamed(content, written)), **progress)
+    return snapshot(path, weights(path, renamed(content, written)), **progress)
 
 
-def nested(path: Path | str, arrays: Mapping[str, Any]) -> Any:
-    """Nested dictionaries of arrays whose names are paths.
+def weights(path: Path | str, arrays: Mapping[str, np.ndarray]) -> Any:
+    """A network: nested dictionaries of the parameters (float32) whose names are paths.
 
     Raises:
-      FileError: a name has too many parts, or another array's name is its beginning.
+      FileError: one is no parameter, or its name has too many parts or begins with another's.
     """
-    for name in arrays:
+    for name, array in arrays.items():
         parts = name.split("/")
-        if len(parts) > DEEPEST or any("/".join(parts[:n]) in arrays for n in range(1, len(parts))):
-            raise FileError(path, f"{name} is not the name of a parameter")
-    return traverse_util.unflatten_dict(arrays, sep="/")
+        begins = any("/".join(parts[:n]) in arrays for n in range(1, len(parts)))
+        if array.dtype.kind != "f" or len(parts) > DEEPEST or begins:
+            raise FileError(path, f"{name} is not a parameter")
+    single = {name: array.astype(np.float32, copy=False) for name, array in arrays.items()}
+    return traverse_util.unflatten_dict(single, sep="/")
 
 
 def snapshot(path: Path | str, weights: Any, **progress: Any) -> Snapshot:
@@ -132,6 +130,12 @@ def snapshot(path: Path | str, weights: Any, **progress: Any) -> Snapshot:
     Raises:
       FileError: the progress is not what it must be; the message names the field.
     """
+    check_progress(path, progress)
+    return Snapshot(weights=weights, **progress)
+
+
+def check_progress(path: Path | str, progress: Mapping[str, Any]) -> None:
+    """Raises FileError if a field of a run's progress is not what it must be, and names it."""
     for name, value in progress.items():
         if name == "data_version":
             if not isinstance(value, str) or not value.isprintable() or len(value) > 100:
@@ -140,7 +144,6 @@ def snapshot(path: Path | str, weights: Any, **progress: Any) -> Snapshot:
         least = jsons.number(path, value, name, 1e15)
         if least < 0 or (type(value) is not int and name != "seconds"):
             raise FileError(path, f"{name} is {value}: not a count")
-    return Snapshot(weights=weights, **progress)
 
 
 def check_fit(path: Path | str, weights: Any, expected: Any, width: int | None = None) -> None:

@@ -600,8 +600,8 @@ def test_a_run_of_the_first_version_still_decides_as_it_did(tmp_path):
 def test_a_checkpoint_of_a_newer_version_is_refused_in_one_line(tmp_path):
     run = shutil.copytree(OLD_RUN, tmp_path / "run")
     meta = run / "checkpoints" / "2" / "meta" / "metadata"
-    meta.write_text(meta.read_text().replace('"format": 1', '"format": 3'))
-    with pytest.raises(ValueError, match="checkpoint of format 3, this version reads up to 2"):
+    meta.write_text(meta.read_text().replace('"format": 1', '"format": 4'))
+    with pytest.raises(ValueError, match="checkpoint of format 4, this version reads up to 3"):
         tdanet_jax.load(run)
 
 

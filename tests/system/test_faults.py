@@ -106,8 +106,6 @@ def test_a_damaged_asset_is_one_line_and_nothing_is_written(
     assert not out.exists()
 
 
-# TensorStore's threads may report to Orbax's event loop after it has closed.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
     ("updates", "left"),
     [(0, "there is no other"), pytest.param(20, "the one before it is 10", marks=pytest.mark.slow)],
