@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from pathlib import Path
 from typing import Literal
 
@@ -192,7 +193,7 @@ def make_task(
 
     Args:
       config: the run's configuration.
-      tables: all rooms.
+      tables: all rooms. Their objects without a word vector are hidden, with a warning.
       vectors: the word vectors.
       extras: what came with imported rooms. Their parents and class graph, if there are any,
         replace those found in the training rooms. Hidden classes are in neither.
@@ -202,17 +203,18 @@ def make_task(
         `generated_only` alone. Parents and class graph are those of the training rooms themselves.
 
     Raises:
-      ValueError: there are no rooms to train or to evaluate in, a class has no word vector, or the
+      ValueError: there are no rooms to train or to evaluate in, a target has no word vector, or the
         model needs feature maps and there are none.
     """
     tables, split = _split(config, Rooms(tables, extras))
+    tables = _in_words(tables, split, vectors)
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
     adjacency = None if extras is None else extras.class_graph(tables.classes)
     if adjacency is None:
         adjacency = class_graph.co_occurrence(seen_rooms)
     classes = make_vocabulary(tables.classes, split.hidden, adjacency)
     model = make_model(config, classes)
-    words = vectors.table(tables.classes, config.network.word_norm)
+    words = vectors.table(tables.classes, config.network.word_norm, blank=True)
     train_words = zero_shot.hide_words(words, tables.classes, split.hidden)
     parents = _parents(seen_rooms, split, extras)
     trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]
@@ -221,6 +223,7 @@ def make_task(
             flag = "--variants" if config.variants else "--generated"
             raise ValueError(f"{flag}: there are no feature maps of these rooms")
         varied = with_targets(varied, tables.targets)
+        varied = _in_words(varied, split, vectors)
         hidden = zero_shot.hide_classes(varied, split.hidden)
         own = [] if config.generated_only else [seen_rooms]
         seen_rooms = tabulation.join([*own, hidden], tables.classes)
@@ -264,6 +267,34 @@ def make_task(
         extras=extras,
         variants_version=None if varied is None else varied.data_version,
     )
+
+
+def _in_words(tables: SceneTables, split: Split, vectors: WordVectors) -> SceneTables:
+    """The rooms without the classes that have no word vector: agents ignore such detections.
+
+    Raises:
+      ValueError: a target has none.
+    """
+    named = vectors.described(tables.classes)
+    unnamed = [name for name in tables.classes if name not in named]
+    if not unnamed:
+        return tables
+    lacking = ", ".join(vectors.missing(unnamed))
+    sought = {
+        name for part in (split.seen, split.unseen) for names in part.values() for name in names
+    }
+    if sought & {*unnamed}:
+        asked = ", ".join(vectors.missing(name for name in unnamed if name in sought))
+        raise ValueError(
+            f"no word vectors for the targets {asked}: give a file with --word-vectors, or other "
+            "--targets"
+        )
+    warnings.warn(
+        f"no word vectors for {lacking}: agents do not see such objects; to show them, give a file "
+        "with --word-vectors, or other names",
+        stacklevel=2,
+    )
+    return zero_shot.hide_classes(tables, unnamed)
 
 
 def _split(config: TrainConfig, rooms: Rooms) -> tuple[SceneTables, Split]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from tdanet_jax.io import archive, assets, files
 from tdanet_jax.io.untrusted import FileError, hdf5, npz
+from tdanet_jax.labels import LabelError, Labels
 from tdanet_jax.vocabulary import class_words
 
 ASSET = "words.npz"
@@ -59,16 +60,41 @@ class WordVectors:
         scale = 1.0 if norm is None else norm / max(float(np.linalg.norm(mean)), 1e-12)
         return (scale * mean).astype(np.float32)
 
-    def table(self, names: Sequence[str], norm: float | None = DEFAULT_NORM) -> np.ndarray:
+    def table(
+        self, names: Sequence[str], norm: float | None = DEFAULT_NORM, blank: bool = False
+    ) -> np.ndarray:
         """One row per name: [len(names), D] float32, as `embed` gives it.
+
+        Args:
+          names: class names.
+          norm: the length of a row; None does not scale.
+          blank: give zeros to names without a vector, in place of an error.
 
         Raises:
           ValueError: words have no vector; the message lists them all.
         """
-        lacking = self.missing(names)
-        if lacking:
+        named = self.described(names)
+        if len(named) < len({*names}) and not blank:
+            lacking = self.missing(name for name in names if name not in named)
             raise ValueError(f"no word vectors for {', '.join(lacking)}; --word-vectors FILE")
-        return np.stack([self.embed(name, norm) for name in names])
+        zeros = np.zeros(self.vectors.shape[1], np.float32)
+        return np.stack([self.embed(named[n], norm) if n in named else zeros for n in names])
+
+    def described(self, names: Sequence[str]) -> dict[str, str]:
+        """The names that have a vector, and the name whose vector each has.
+
+        That is its own, or else that of what it means (`Labels.resolve`): "lampstand" has the
+        vector of "lamp stand".
+        """
+        lacking = [name for name in names if self.missing([name])]
+        labels = Labels((), self.index) if lacking else None
+        meant: dict[str, str | None] = {name: name for name in names}
+        for name in lacking:
+            try:
+                meant[name] = labels.resolve(name) if labels else None
+            except LabelError:
+                meant[name] = None
+        return {name: meaning for name, meaning in meant.items() if meaning is not None}
 
     def extended(self, more: WordVectors, source: Path | str = "words") -> WordVectors:
         """With the words of others that it lacks, after its own.

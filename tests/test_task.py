@@ -87,6 +87,35 @@ def test_a_model_that_numbers_classes_is_kept_from_others(
             task.check_known("runs/a", tables.classes[1:])
 
 
+def renamed(tables: SceneTables, **names: str) -> SceneTables:
+    """The rooms with other names of some classes."""
+    return dataclasses.replace(tables, classes=tuple(names.get(c, c) for c in tables.classes))
+
+
+def test_classes_without_a_word_vector_are_hidden_with_one_warning(
+    ithor: SceneTables, glove: WordVectors
+) -> None:
+    odd = renamed(rooms(ithor), Faucet="flux capacitor", Cabinet="zzqx", Pan="Lampstand")
+    message = r"for zzqx \(zzqx\), flux capacitor \(.*capacitor\): agents do not see such objects"
+    with pytest.warns(UserWarning, match=message) as said:
+        task = make_task(TrainConfig(network=SMALL), odd, glove)
+    assert len(said) == 1
+    hidden = [odd.classes.index(name) for name in ("flux capacitor", "zzqx")]
+    known = odd.classes.index("Lampstand")  # its vector is that of "lamp stand"
+    assert not np.asarray(task.words)[hidden].any()
+    assert np.asarray(task.words)[known].any()
+    assert np.isin([*hidden, known], odd.object_class).all()
+    for params in (task.train_params, task.eval_params):
+        assert not np.isin(hidden, np.asarray(params.row_class)).any()
+    assert known in np.asarray(task.eval_params.row_class)
+
+
+def test_a_target_without_a_word_vector_is_refused(ithor: SceneTables, glove: WordVectors) -> None:
+    odd = renamed(rooms(ithor), Faucet="zzqx")
+    with pytest.raises(ValueError, match=r"^no word vectors for the targets zzqx \(zzqx\): give a"):
+        make_task(TrainConfig(network=SMALL, targets="zzqx,Sink"), odd, glove)
+
+
 def test_models_without_an_image_are_shown_none(ithor: SceneTables, glove: WordVectors) -> None:
     task = make_task(TrainConfig(network=SMALL), rooms(ithor), glove)
     assert task.image is None

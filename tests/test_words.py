@@ -122,6 +122,18 @@ def test_a_text_file_of_glove(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         found.table(["Coffee", "TableTop", "Xy"])
 
 
+def test_a_name_without_a_vector_of_its_own_has_that_of_what_it_means(glove: WordVectors) -> None:
+    names = ["Mug", "Lampstand", "flux capacitor", "zzqx"]
+    assert glove.described(names) == {"Mug": "Mug", "Lampstand": "lamp stand"}
+    with pytest.raises(
+        ValueError, match=r"^no word vectors for flux capacitor \(.*, zzqx \(zzqx\);"
+    ):
+        glove.table(names)
+    table = glove.table(names, blank=True)
+    np.testing.assert_array_equal(table[:2], glove.table(["Mug", "LampStand"]))
+    assert not table[2:].any()
+
+
 def test_a_file_with_a_vector_per_class_name(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
     path = tmp_path / "glove_map300d.hdf5"

@@ -257,7 +257,7 @@ class Agent(BaseAgent):
         if self._table is None or self._table_rows != len(self._rows):
             self._table_rows = len(self._rows)
             names = [" ".join(key) for key in self._rows]
-            table = self._vectors.table(names, self.config.network.word_norm)
+            table = self._vectors.table(names, self.config.network.word_norm, blank=True)
             rest = -len(table) % LABEL_BLOCK
             self._table = _prepare(self.model, self.weights, np.pad(table, ((0, rest), (0, 0))))
         return self._table

@@ -46,7 +46,7 @@ class BaseAgent:
     ) -> None:
         self.grid: PoseGrid = spec.grid
         self.spec = spec
-        self.labels = Labels(classes, vectors.index, synonyms)
+        self.labels = Labels(tuple(vectors.described(classes)), vectors.index, synonyms)
         self._names = tuple(classes)
         self._vectors = vectors
         self._synonyms = synonyms
@@ -101,7 +101,8 @@ class BaseAgent:
         source = "words" if isinstance(more, Mapping) else more
         vectors = self._vectors.extended(words.read_words(more), source)
         added = len(vectors.index) - len(self._vectors.index)
-        self.labels = Labels(self._names, vectors.index, self._synonyms)
+        named = tuple(vectors.described(self._names))
+        self.labels = Labels(named, vectors.index, self._synonyms)
         self._vectors, self._row_of = vectors, {}
         return added
 

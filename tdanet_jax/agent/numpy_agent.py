@@ -171,7 +171,7 @@ class NumPyAgent(BaseAgent):
         """The vector [D] of the name in a row of the table of classes."""
         if row not in self._embedded:
             name = " ".join([*self._rows][row])
-            self._embedded[row] = self._vectors.embed(name, self.meta.word_norm)
+            (self._embedded[row],) = self._vectors.table([name], self.meta.word_norm)
         return self._embedded[row]
 
     def _target(self, row: int) -> Target:

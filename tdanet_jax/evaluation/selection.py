@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +21,7 @@ from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.sense_noise import SenseNoise
 from tdanet_jax.sensors.noise import levels_of
+from tdanet_jax.splits import labels_of
 from tdanet_jax.task import Task
 
 
@@ -62,7 +64,10 @@ def choose(
     scenes = {group: _scene_names(chosen, tables) for group, chosen in lists.items()}
     targets = {group: np.array(tables.targets)[one.target] for group, one in lists.items()}
     wanted_scenes = find_names("scenes", test.scenes, np.unique([*_values(scenes)]))
-    wanted_targets = find_names("targets", test.targets, np.unique([*_values(targets)]))
+    played = tuple(map(str, np.unique([*_values(targets)])))
+    meant = [labels_of(played).find(label) for label in test.targets]
+    asked = [m if m in played else label for m, label in zip(meant, test.targets, strict=True)]
+    wanted_targets = find_names("targets", asked, played)
     out = {}
     for group, one in lists.items():
         kept = np.isin(scenes[group], wanted_scenes) & np.isin(targets[group], wanted_targets)
@@ -88,6 +93,8 @@ def find_names(flag: str, given: Collection[str], known: Iterable[str]) -> list[
             similar = {each.lower(): each for each in names}
             near = difflib.get_close_matches(name.lower(), similar, n=1)
             hint = f"did you mean {similar[near[0]]}?" if near else f"there are {', '.join(names)}"
+            if Path(name).is_file():
+                hint = "rooms of your own are imported (tdanet scenes import) and given with --data"
             raise ValueError(f"--{flag} {name}: in no test episode; {hint}")
     return list(given) or names
 

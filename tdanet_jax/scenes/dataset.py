@@ -129,6 +129,10 @@ def load_rooms(path: str | Path | None, progress: Progress | None = None) -> Roo
     if path is None:
         return Rooms(cache.load_tables(progress), None)
     path = Path(path)
+    if path.suffix == ".json" and path.is_file():
+        raise FileError(
+            path, "a scene file: first run tdanet scenes import, which writes its rooms"
+        )
     arrays = npz.read(path)
     try:
         tables = SceneTables.from_arrays(arrays)

@@ -17,6 +17,7 @@ import tdanet_jax
 from tdanet_jax import config as configs
 from tdanet_jax.agent.agent import Agent
 from tdanet_jax.agent.detection import Detection
+from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.params import TEST_STEP_LIMITS, make_params
@@ -195,6 +196,34 @@ def test_the_target_is_recognised_by_any_of_its_names(triangulating_agent, targe
     assert one.sensors["triangulation"].normal.any()
     chex.assert_trees_all_equal(one, other)
     np.testing.assert_array_equal(decided.probabilities, expected.probabilities)
+
+
+def test_a_navigator_recognises_the_target_by_any_of_its_names(triangulating_agent):
+    config = NavigatorConfig(forbid=("Done",), keep_frames=1)
+
+    def looks_for(target, *labels):
+        nav = Navigator(triangulating_agent, config=config).reset(target)
+        for label in labels:
+            nav.step([Detection(label, 0.1, 0.1, 0.3, 0.4)], blocked=True)
+        assert len(nav.seen) == 1  # it is the same thing: the earlier box is not kept
+        return nav.decision.probabilities
+
+    one, other = looks_for("television", "tv", "TVs"), looks_for("tv", "Television", "television")
+    np.testing.assert_array_equal(one, other)
+    assert (one != looks_for("television", "mug", "mug")).any()
+
+
+def test_a_class_without_a_word_vector_is_unknown_until_it_is_given_one(weights, glove):
+    """As of a run in rooms with such objects, which it did not see."""
+    agent = Agent(CONFIG, weights, glove, ClassVocabulary(("zzqx", "Mug"), (0, 1)))
+    mug, odd = (Detection(name, 0.1, 0.1, 0.3, 0.4) for name in ("mug", "zzqx"))
+    agent.act(agent.start(), [mug], "mug")
+    with pytest.raises(KeyError, match="no word vector for zzqx"):
+        agent.act(agent.start(), [odd], "mug")
+    agent.add_words({"zzqx": glove.embed("mug", None)})
+    _, one = agent.act(agent.start(), [odd], "zzqx")
+    _, other = agent.act(agent.start(), [mug], "mug")
+    np.testing.assert_allclose(one.probabilities, other.probabilities, rtol=1e-4)
 
 
 def test_of_another_target_an_agent_has_never_seen_anything(triangulating_agent):

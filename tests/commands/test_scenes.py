@@ -218,7 +218,7 @@ def test_unused_rooms_and_missing_word_vectors_are_reported(
     assert said.err.startswith("warning: no split uses Lab; a run needs a room to train in")
     assert len(said.err.splitlines()) == 1
     assert "Rooms to train in: 1; to be evaluated in: 0" in said.out
-    assert "Needs --word-vectors: no bundled ones for MugXqzzy (xqzzy)" in said.out
+    assert "No bundled word vectors for MugXqzzy (xqzzy): without --word-vectors" in said.out
 
 
 @pytest.mark.parametrize(

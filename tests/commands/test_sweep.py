@@ -261,8 +261,8 @@ def test_a_sweep_continues_only_with_the_same_flags_of_each_model(tmp_path, caps
     arguments = ["--models", "tdanet", "savn", "--seeds", "0", "--steps", "9", "--out"]
     own = ["--per-model", "savn: --num-envs 64 --learning-rate 1e-3"]
     sweep.main([*arguments, str(tmp_path), *own])
-    used = configs.load(tmp_path / "18-4-savn-seed0" / "config.json").learner
-    assert (used.num_envs, used.learning_rate) == (64, 1e-3)
+    used = configs.load(tmp_path / "18-4-savn-seed0" / "config.json")
+    assert (used.steps, used.learner.num_envs, used.learner.learning_rate) == (9, 64, 1e-3)
     assert configs.load(tmp_path / "18-4-tdanet-seed0" / "config.json").learner == LearnerConfig()
     sweep.main([*arguments, str(tmp_path), *own])
     assert len(trained) == 2

@@ -74,14 +74,19 @@ def test_rooms_and_targets_are_chosen_by_name(
     assert set(both["seen"]) == {("FloorPlan228", "Television")}
     assert len(both["unseen"]) == 5
     assert list(chosen(lists, ithor, targets=["Laptop"])) == ["unseen"]  # never a seen one
+    by_label = chosen(lists, ithor, targets=["laptops", "tv"])  # as a detector calls them
+    assert by_label == chosen(lists, ithor, targets=["Laptop", "Television"])
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
         ({"targets": ("Laptpo",)}, "--targets Laptpo: in no test episode; did you mean Laptop?"),
-        ({"targets": ("laptop",)}, "--targets laptop: in no test episode; did you mean Laptop?"),
         ({"targets": ("Oxygen",)}, "--targets Oxygen: in no test episode; there are AlarmClock, "),
+        (
+            {"scenes": (__file__,)},
+            f"--scenes {__file__}: in no test episode; rooms of your own are",
+        ),
         ({"scenes": ("FloorPlan1",)}, "--scenes FloorPlan1: in no test episode; did you mean"),
         (
             {"scenes": ("FloorPlan228",), "targets": ("Toaster",)},

@@ -151,8 +151,13 @@ def uses(rooms: Rooms) -> Iterator[str]:
         )
     if not (tables.row_box >= 0).any():
         yield "No boxes in any room: an agent that sees detections will see nothing."
-    if lacking := words.load_bundled().missing(tables.classes):
-        yield f"Needs --word-vectors: no bundled ones for {', '.join(lacking)}"
+    bundled = words.load_bundled()
+    described = bundled.described(tables.classes)
+    if lacking := bundled.missing(name for name in tables.classes if name not in described):
+        yield (
+            f"No bundled word vectors for {', '.join(lacking)}: without --word-vectors, agents do "
+            "not see such objects"
+        )
 
 
 def _listed(names: Sequence[str]) -> str:
