@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -84,6 +83,10 @@ def main(folder: str, out: str) -> None:
 
 def _limit() -> None:
     """Limits what this process takes; if it crashes, it leaves no core dump."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits
+        return
     memory = int(budgets().unpacked) + _OWN_MEMORY
     for kind, most in (
         (resource.RLIMIT_CORE, 0),
