@@ -1,6 +1,6 @@
 """PPO with an LSTM in the manner of CleanRL's `ppo_atari_lstm.py`: one file, PyTorch, Gymnasium.
 
-`pip install torch 'tdanet_jax[gymnasium]'`, then `python examples/cleanrl_ppo_lstm.py`: trains in
+`pip install torch -e '.[gymnasium]'`, then `python examples/cleanrl_ppo_lstm.py`: trains in
 the rooms of split 18/4, and plays the test episodes.
 """
 

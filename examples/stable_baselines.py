@@ -1,6 +1,6 @@
 """Stable-Baselines3 in the rooms of split 18/4: PPO, or with a memory, sb3-contrib's RecurrentPPO.
 
-`pip install stable-baselines3 sb3-contrib 'tdanet_jax[gymnasium]'`, then
+`pip install stable-baselines3 sb3-contrib -e '.[gymnasium]'`, then
 `python examples/stable_baselines.py`: trains, and plays the test episodes.
 """
 
