@@ -134,7 +134,7 @@ def decide_alike(agent, some_rooms, glove, rotation=0, steps=3):
 @pytest.mark.parametrize(
     "who",
     [
-        "agent",
+        pytest.param("agent", marks=pytest.mark.slow),
         "triangulating_agent",
         pytest.param("merging_agent", marks=pytest.mark.slow),
         pytest.param("counting_agent", marks=pytest.mark.slow),
@@ -494,7 +494,9 @@ def several(agent, steps, together):
     return states, shown
 
 
-@pytest.mark.parametrize("who", ["agent", "triangulating_agent"])
+@pytest.mark.parametrize(
+    "who", [pytest.param("agent", marks=pytest.mark.slow), "triangulating_agent"]
+)
 def test_robots_together_decide_as_each_on_its_own(who, request):
     chosen = request.getfixturevalue(who)
     (one, alone), (other, together) = several(chosen, 3, False), several(chosen, 3, True)

@@ -72,7 +72,10 @@ def draw_frame(rng):
     ]
 
 
-@pytest.mark.parametrize("preset", NETWORKS)
+@pytest.mark.parametrize(
+    "preset",
+    ["robust", "rows", *(pytest.param(n, marks=pytest.mark.slow) for n in ("default", "best"))],
+)
 def test_it_decides_as_in_jax(preset, glove, tmp_path):
     theirs = small_agent(glove, **NETWORKS[preset])
     ours = numpy_agent.load(exported(theirs, tmp_path / "out"))

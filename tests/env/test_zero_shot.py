@@ -31,6 +31,11 @@ from tests.support.handmade import FRAME
 
 SPLITS = [("18/4", False), ("14/8", False), ("18/4", True), ("Bread,Mug,Towel", True)]
 NAMES = ["18/4", "14/8", "18/4-validation", "own-validation"]
+#: A split of the paper, and one of one's own on validation; the others are slow.
+OF_EACH_KIND = [
+    pytest.param(split, id=name, marks=() if name in (NAMES[0], NAMES[3]) else pytest.mark.slow)
+    for split, name in zip(SPLITS, NAMES, strict=True)
+]
 
 
 #: Every way in which a class could be shown that is not there.
@@ -290,7 +295,7 @@ def test_perturbing_a_seen_class_is_noticed(rooms: SceneTables, glove: WordVecto
         assert task.classes.edges != other.classes.edges
 
 
-@pytest.mark.parametrize("split", SPLITS, ids=NAMES)
+@pytest.mark.parametrize("split", OF_EACH_KIND)
 def test_no_training_episode_shows_or_asks_for_a_hidden_class(
     rooms: SceneTables, glove: WordVectors, split: tuple[str, bool]
 ) -> None:

@@ -65,7 +65,7 @@ def test_a_published_split_of_other_targets_has_other_episodes(ithor: SceneTable
         assert len(chosen) == 500
 
 
-@pytest.mark.parametrize("validation", [False, True])
+@pytest.mark.parametrize("validation", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_open_benchmark_has_as_many_episodes_for_every_target(
     ithor: SceneTables, validation: bool
 ) -> None:

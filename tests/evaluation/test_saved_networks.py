@@ -111,7 +111,13 @@ def run_of_files(
     return home / "run"
 
 
-@pytest.mark.parametrize("shared", [False, True], ids=["the run", "what is shared of it"])
+@pytest.mark.parametrize(
+    "shared",
+    [
+        pytest.param(False, id="the run", marks=pytest.mark.slow),
+        pytest.param(True, id="what is shared of it"),
+    ],
+)
 def test_a_run_leaves_its_machine(
     run_of_files: Path,
     few_episodes: None,

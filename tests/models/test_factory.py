@@ -72,9 +72,18 @@ def can_triangulate(name: str) -> bool:
     return name.startswith("tdanet")
 
 
+#: Of each kind of model one, of which the sensors are tested every time.
+KINDS = ("tdanet", "ssnet", "savn", "li")
+
+
 @pytest.mark.parametrize(
     ("name", "triangulation"),
-    [(name, can_triangulate(name)) for name in MODELS],
+    [
+        pytest.param(
+            name, can_triangulate(name), marks=() if name in KINDS else pytest.mark.slow, id=name
+        )
+        for name in MODELS
+    ],
 )
 def test_every_named_model_takes_sensors(name: str, triangulation: bool) -> None:
     config = with_sensors(dataclasses.replace(SMALL, model=name), triangulation)

@@ -19,6 +19,8 @@ from tdanet_jax.vocabulary import Action
 
 BOTH = ObservationSpec(sensors=("odometry", "triangulation"))
 ROBUST = ObservationSpec(sensors=("odometry", "robust-triangulation"))
+THIRTY = dataclasses.replace(BOTH, grid=PoseGrid(0.4, 12, (-30, 0, 45)))
+ALONE = ObservationSpec(sensors=("odometry",))
 ROWS, STEPS = 4, 60
 
 
@@ -43,12 +45,11 @@ def draw_frame(rng, target):
 @pytest.mark.parametrize(
     "spec",
     [
-        BOTH,
-        ROBUST,
-        dataclasses.replace(BOTH, grid=PoseGrid(0.4, 12, (-30, 0, 45))),
-        ObservationSpec(sensors=("odometry",)),
+        pytest.param(BOTH, id="ithor"),
+        pytest.param(ROBUST, id="robust"),
+        pytest.param(THIRTY, id="30-degrees", marks=pytest.mark.slow),
+        pytest.param(ALONE, id="odometry", marks=pytest.mark.slow),
     ],
-    ids=["ithor", "robust", "30-degrees", "odometry"],
 )
 def test_they_say_what_those_in_jax_say(spec, measured):
     """In float64: in float32, nearly parallel rays leave few digits of the estimate."""

@@ -190,7 +190,7 @@ def test_every_step_is_that_of_the_slow_odometry(diagonal: bool, horizon: int, r
     "grid",
     [
         PoseGrid(0.5, 4, (0,)),
-        PoseGrid(0.25, 6, (0, 30)),
+        pytest.param(PoseGrid(0.25, 6, (0, 30)), marks=pytest.mark.slow),
         PoseGrid(0.1, 12, (-30, 0, 30)),
         PoseGrid(0.25, 24, (-15, 0, 60)),
     ],
@@ -394,7 +394,7 @@ def toy_rooms() -> SceneTables:
     return build([toy.corridor(), *rooms], targets=("Apple", "Mug", "Sofa"))
 
 
-@pytest.fixture(params=["real", "toy"])
+@pytest.fixture(params=["real", pytest.param("toy", marks=pytest.mark.slow)])
 def tables(request: pytest.FixtureRequest) -> SceneTables:
     if request.param == "toy":
         return toy_rooms()

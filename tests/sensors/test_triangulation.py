@@ -682,7 +682,7 @@ def params_of(tables: SceneTables, triangulation: bool, limit: int = 1000) -> En
     return make_params(tables, targets, no_parents(tables), limits, spec)
 
 
-@pytest.fixture(params=["real", "toy"])
+@pytest.fixture(params=["real", pytest.param("toy", marks=pytest.mark.slow)])
 def tables(request: pytest.FixtureRequest) -> SceneTables:
     if request.param == "toy":
         return toy_rooms()

@@ -230,7 +230,13 @@ sys.meta_path.insert(0, Striker())
             signal.SIGTERM,
             marks=pytest.mark.slow,
         ),
-        ("scenes", ("inspect", "FloorPlan1", "--out"), "matplotlib.figure", signal.SIGINT),
+        pytest.param(
+            "scenes",
+            ("inspect", "FloorPlan1", "--out"),
+            "matplotlib.figure",
+            signal.SIGINT,
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_signal_waits_until_a_library_is_loaded(

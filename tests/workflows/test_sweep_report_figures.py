@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tdanet_jax.config import TrainConfig
-from tdanet_jax.evaluation import paper
+from tdanet_jax.evaluation import comparison, paper
 from tdanet_jax.evaluation.paper import WORLDS_DIFFER
 from tdanet_jax.registry import MODELS
 from tdanet_jax.workflows import sweep_report
@@ -24,6 +24,7 @@ def run(
 ) -> FinishedRun:
     config = TrainConfig(seed=seed, model=model, split=split, steps=1000)
     results = made_up(seed, start, split=split) | {"model": model}
+    results["settings"] = comparison.settings(config)
     return FinishedRun(Path(f"run{seed}"), config, results, seconds)
 
 

@@ -278,7 +278,7 @@ def test_boxes_agree_with_dense_rays_in_real_rooms() -> None:
     overlaps: list[float] = []
     total = agreement.Confusion()
     for number in (5, 48, 70, 101):
-        states = draw.choice(len(scenes[number].points) * 16, 3, replace=False)
+        states = draw.choice(len(scenes[number].points) * 16, 2, replace=False)
         more, classes = dense_rays.compare_boxes(scenes[number], RULES, states)
         overlaps += more
         total += classes
