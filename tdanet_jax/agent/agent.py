@@ -76,7 +76,7 @@ class Agent(BaseAgent):
         self.model: ActorCritic = make_model(config, self.classes)
         spec = dataclasses.replace(self.model.spec, grid=grid)
         super().__init__(self.classes.names, vectors, spec, synonyms)
-        self.weights = weights
+        self.weights = jax.device_put(weights)  # NumPy arrays would be copied in each step
         self._table: Any = None
         self._table_rows = 0
         self._begin = jax.jit(self._first)

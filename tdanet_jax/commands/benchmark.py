@@ -44,8 +44,10 @@ if TYPE_CHECKING:
 
 Part = Literal[
     "tables", "import", "startup", "machine", "environment", "rollout", "update", "evaluation",
-    "decision", "quality",
+    "decision", "agent", "quality",
 ]  # fmt: skip
+#: The agent of the `agent` part.
+BUNDLED = "18-4-best"
 #: What is measured if `--parts` is not given: all that takes no training.
 SHORT = tuple(part for part in get_args(Part) if part != "quality")
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -66,7 +68,8 @@ class Command:
     networks: tuple[int, ...] = (1,)
     """Numbers of networks that are evaluated in one call; 20 is a run's history."""
     checkpoint: RunPath | None = None
-    """Run whose trained network the `evaluation` part plays; by default an untrained one."""
+    """Run whose trained network the `evaluation` part plays, by default an untrained one, and with
+    which the `agent` part acts, by default 18-4-best."""
     models: tuple[str, ...] = ("tdanet",)
     """Models of the `rollout`, `update` and `decision` parts."""
     odometry: bool = False
@@ -179,6 +182,8 @@ def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
     if "evaluation" in command.parts:
         for networks in command.networks:
             yield benchmarking.evaluation_row(command.checkpoint, task, networks, command.repeats)
+    if "agent" in command.parts:
+        yield benchmarking.agent_row(command.checkpoint or BUNDLED)
     if "quality" in command.parts:
         from tdanet_jax.tools import quality
 

@@ -6,17 +6,25 @@ Every value is the median over repetitions. Each function returns a row of resul
 from __future__ import annotations
 
 import functools
+import os
 import platform
 import statistics
+import subprocess
+import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh
 
+from tdanet_jax.agent import agent as saved_agents
+from tdanet_jax.agent import numpy_agent
+from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import EnvParams, Observation
@@ -27,6 +35,7 @@ from tdanet_jax.sensors import suite
 from tdanet_jax.task import Task, load_task
 from tdanet_jax.training import devices, history, learner
 from tdanet_jax.vocabulary import NUM_ACTIONS
+from tdanet_jax.workflows.export import export
 
 Row = dict[str, Any]
 
@@ -257,6 +266,76 @@ def evaluation_row(run: Path | None, task: Task, networks: int, repeats: int) ->
         "compile_seconds": round(first - seconds, 2),
         "seconds": round(seconds, 2),
     }
+
+
+#: Objects in each frame of `agent_row`, frames that are timed, and robots that decide together.
+IN_VIEW, FRAMES, ROBOTS = 12, 200, 100
+
+
+def agent_row(run: Path | str) -> Row:
+    """What a robot waits for: the steps of a trained agent, with random boxes in view.
+
+    Returns:
+      Median milliseconds of `Agent.act`, of `Agent.act_many` for `ROBOTS` robots, and of the same
+      agent without JAX; and the seconds from the start of Python to the first action, with the
+      programs compiled before, and without JAX. A model that is not exported has no figures
+      without JAX.
+    """
+    agent, rng = saved_agents.load(run), np.random.default_rng(0)
+    names = [agent.classes.names[i] for i in rng.integers(0, len(agent.classes.names), IN_VIEW)]
+
+    def frame() -> list[Detection]:
+        low = rng.uniform(0, 0.8, (IN_VIEW, 2))
+        boxes = np.concatenate([low, low + rng.uniform(0.02, 0.2, (IN_VIEW, 2))], axis=1)
+        return [Detection(n, *map(float, box)) for n, box in zip(names, boxes, strict=True)]
+
+    frames = [frame() for _ in range(FRAMES)]
+
+    def milliseconds(who: Any) -> float:
+        state, taken = who.start(), []
+        for seen in (*frames[:10], *frames):
+            began = time.perf_counter()
+            state, _ = who.act(state, seen, names[0], blocked=False)
+            taken.append(time.perf_counter() - began)
+        return round(1e3 * statistics.median(taken[10:]), 3)
+
+    states = [agent.start()] * ROBOTS
+    together = functools.partial(
+        agent.act_many, states, frames[:ROBOTS], names[:1] * ROBOTS, None, [False] * ROBOTS
+    )
+    row: Row = {
+        "part": "agent",
+        "milliseconds": milliseconds(agent),
+        f"milliseconds_{ROBOTS}_robots": round(1e3 * timed(together, 20)[1], 3),
+    }
+    with tempfile.TemporaryDirectory() as place:
+        started = [sys.executable, "-c", FIRST_ACTION.format(module="tdanet_jax", run=str(run))]
+        compiled = os.environ | {"JAX_COMPILATION_CACHE_DIR": f"{place}/compiled"}
+        compiled |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        row["seconds_to_first_action"] = [_seconds(started, compiled) for _ in range(4)][-1]
+        try:
+            folder = export(run, Path(place) / "exported")
+        except ValueError:
+            return row
+        row["milliseconds_without_jax"] = milliseconds(numpy_agent.load(folder))
+        code = FIRST_ACTION.format(module="tdanet_jax.robot", run=str(folder))
+        alone = {**os.environ, "PYTHONPATH": str(folder)}
+        row["seconds_to_first_action_without_jax"] = _seconds([sys.executable, "-c", code], alone)
+    return row
+
+
+#: A program that ends with an agent's first action.
+FIRST_ACTION = """
+import {module} as tdanet
+agent = tdanet.load({run!r})
+agent.act(agent.start(), [tdanet.Detection("mug", 0.2, 0.3, 0.4, 0.5)], "mug")
+"""
+
+
+def _seconds(command: list[str], variables: Mapping[str, str]) -> float:
+    began = time.perf_counter()
+    subprocess.run(command, env=variables, check=True, stdout=subprocess.DEVNULL)
+    return round(time.perf_counter() - began, 2)
 
 
 def decision_row(task: Task, count: int, repeats: int) -> Row:

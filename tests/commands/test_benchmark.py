@@ -97,6 +97,18 @@ def test_the_hand_formula_counts_the_kernels_that_a_step_uses(senses):
 
 
 @pytest.mark.slow
+def test_a_robots_steps_are_timed_with_jax_and_without(ithor, tmp_path):
+    out = tmp_path / "figures.jsonl"
+    benchmark.main(["--parts", "agent", "--out", str(out)])
+    row = json.loads(out.read_text().splitlines()[-1])
+    assert row.pop("part") == "agent"
+    assert len(row) == 5
+    assert all(value > 0 for value in row.values())
+    assert row["seconds_to_first_action_without_jax"] < row["seconds_to_first_action"]
+    assert row["milliseconds_100_robots"] < 100 * row["milliseconds"]
+
+
+@pytest.mark.slow
 def test_an_evaluation_plays_the_networks_of_a_run_in_one_call(ithor, tmp_path):
     out = tmp_path / "figures.jsonl"
     flags = ["--networks", "2", "--checkpoint", str(OLD_RUN), "--repeats", "1", "--out", str(out)]

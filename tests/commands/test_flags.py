@@ -136,7 +136,7 @@ class Record(tuple):
 
 BENCHMARKS = tuple(
     f"tdanet_jax.tools.benchmarking.{part}_row"
-    for part in ("environment", "rollout", "update", "evaluation", "decision")
+    for part in ("environment", "rollout", "update", "evaluation", "decision", "agent")
 )
 MODEL_TASK = SimpleNamespace(model=SimpleNamespace(dtype="float32"))
 
