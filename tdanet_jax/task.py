@@ -207,7 +207,8 @@ def make_task(
         model needs feature maps and there are none.
     """
     tables, split = _split(config, Rooms(tables, extras))
-    tables = _in_words(tables, split, vectors)
+    unnamed = _without_words(tables, split, vectors)
+    tables = zero_shot.hide_classes(tables, unnamed)
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
     adjacency = None if extras is None else extras.class_graph(tables.classes)
     if adjacency is None:
@@ -223,8 +224,7 @@ def make_task(
             flag = "--variants" if config.variants else "--generated"
             raise ValueError(f"{flag}: there are no feature maps of these rooms")
         varied = with_targets(varied, tables.targets)
-        varied = _in_words(varied, split, vectors)
-        hidden = zero_shot.hide_classes(varied, split.hidden)
+        hidden = zero_shot.hide_classes(varied, {*split.hidden, *unnamed})
         own = [] if config.generated_only else [seen_rooms]
         seen_rooms = tabulation.join([*own, hidden], tables.classes)
     train_maps, eval_maps = _feature_maps(config.model, model, features, trains, tables.grid)
@@ -269,8 +269,8 @@ def make_task(
     )
 
 
-def _in_words(tables: SceneTables, split: Split, vectors: WordVectors) -> SceneTables:
-    """The rooms without the classes that have no word vector: agents ignore such detections.
+def _without_words(tables: SceneTables, split: Split, vectors: WordVectors) -> list[str]:
+    """The classes that have no word vector, with a warning: agents do not see such objects.
 
     Raises:
       ValueError: a target has none.
@@ -278,7 +278,7 @@ def _in_words(tables: SceneTables, split: Split, vectors: WordVectors) -> SceneT
     named = vectors.described(tables.classes)
     unnamed = [name for name in tables.classes if name not in named]
     if not unnamed:
-        return tables
+        return []
     lacking = ", ".join(vectors.missing(unnamed))
     sought = {
         name for part in (split.seen, split.unseen) for names in part.values() for name in names
@@ -294,7 +294,7 @@ def _in_words(tables: SceneTables, split: Split, vectors: WordVectors) -> SceneT
         "with --word-vectors, or other names",
         stacklevel=2,
     )
-    return zero_shot.hide_classes(tables, unnamed)
+    return unnamed
 
 
 def _split(config: TrainConfig, rooms: Rooms) -> tuple[SceneTables, Split]:

@@ -98,7 +98,7 @@ def test_classes_without_a_word_vector_are_hidden_with_one_warning(
     odd = renamed(rooms(ithor), Faucet="flux capacitor", Cabinet="zzqx", Pan="Lampstand")
     message = r"for zzqx \(zzqx\), flux capacitor \(.*capacitor\): agents do not see such objects"
     with pytest.warns(UserWarning, match=message) as said:
-        task = make_task(TrainConfig(network=SMALL), odd, glove)
+        task = make_task(TrainConfig(network=SMALL), odd, glove, varied=odd)
     assert len(said) == 1
     hidden = [odd.classes.index(name) for name in ("flux capacitor", "zzqx")]
     known = odd.classes.index("Lampstand")  # its vector is that of "lamp stand"

@@ -45,7 +45,7 @@ class AgentState(NamedTuple):
     """What the agent carries from step to step of one episode."""
 
     recurrent: RecurrentState  # of the network, a batch of one
-    action: jax.Array  # int32, the previous action; 6 at the start
+    action: jax.Array | np.int32  # the previous action; 6 at the start
     sensors: Mapping[str, Any]  # states of the sensors before that action
     target: jax.Array  # int32, what it looked for in the previous step; -1 at the start
 
@@ -282,7 +282,9 @@ class Agent(BaseAgent):
         """The state but for the next action, policy and value, and the attention."""
         spec = self.spec
         frame = Frame(obs.classes[0], obs.boxes[0], obs.mask[0], obs.target[0])
-        sensors = suite.update(spec, state.sensors, Motion(state.action, blocked, measured=pose))
+        sensors = suite.update(
+            spec, state.sensors, Motion(jnp.asarray(state.action), blocked, measured=pose)
+        )
         sensors = suite.clear(spec, sensors, state.target != frame.target)
         sensors = suite.observe(spec, sensors, frame)
         readings = jax.tree.map(lambda x: x[None], suite.read(spec, sensors))
@@ -322,8 +324,7 @@ def _decision(
         value=float(np.asarray(out.value)[0]),
         attention=None if attention is None else np.asarray(attention)[0][owner],
     )
-    taken: Any = np.int32(action)
-    return state._replace(action=taken), decision
+    return state._replace(action=np.int32(action)), decision
 
 
 def load(

@@ -89,7 +89,7 @@ class Command:
     most_steps: int = 6_000_000
     """Budget of each run of the `quality` part, in environment steps."""
     repeats: int = 5
-    """Repetitions of each measurement."""
+    """Repetitions of each measurement but those of `agent` and `quality`."""
     out: Path | None = None
     """File for the results, one JSON object per line, written as they come; must not exist."""
 
@@ -182,6 +182,10 @@ def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
     if "evaluation" in command.parts:
         for networks in command.networks:
             yield benchmarking.evaluation_row(command.checkpoint, task, networks, command.repeats)
+    sensors = {"odometry": command.odometry, "triangulation": command.triangulation}
+    for name in command.models:
+        for row in model_rows(command, name, peak):
+            yield {"part": row.pop("part"), "model": name, **sensors, **row}
     if "agent" in command.parts:
         yield benchmarking.agent_row(command.checkpoint or BUNDLED)
     if "quality" in command.parts:
@@ -189,10 +193,6 @@ def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
 
         for config in command.trained():
             yield {"preset": command.preset, **quality.quality_row(config)}
-    sensors = {"odometry": command.odometry, "triangulation": command.triangulation}
-    for name in command.models:
-        for row in model_rows(command, name, peak):
-            yield {"part": row.pop("part"), "model": name, **sensors, **row}
 
 
 def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]:

@@ -46,7 +46,7 @@ class Command:
     """The same as --log tensorboard."""
     devices: int = 1
     """Devices in this process to split the environments over; a CPU is split into as many. Further
-    processes, on this or other machines, join if SLURM or Open MPI starts them, or through
+    processes, on this or other machines, join if SLURM or Open MPI 4 starts them, or through
     JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID (docs/cluster.md)."""
 
     @property

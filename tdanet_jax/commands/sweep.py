@@ -3,8 +3,8 @@
     tdanet sweep --splits 18/4 14/8 --seeds 0 1 2 --minutes 10 --out runs/sweep
 
 Every other flag is one of the training command and applies to all runs. After an interruption, run
-the same command again: it skips the finished runs and continues the unfinished one. It leaves the
-runs that another process trains to it, and exits with status 1 if the report lacks any of them.
+the same command again: it skips the finished runs and continues the unfinished one. Runs that
+another process is training are skipped; the exit status is 1 if the report lacks any of them.
 Writes a folder for each run, report.md, report.json and the learning curves into --out.
 """
 
@@ -20,7 +20,7 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,8 +86,8 @@ class Command:
     """Train the seeds of a split and model in one vmapped call; needs a budget in steps. For
     accelerators: on a CPU it is slower than one seed after the other, unless networks are small."""
     shard: str | None = None
-    """I/N: train the I-th of N shares of the runs, I from 1, and write no report. For several
-    machines, which need not share a folder; --report-only then reports on all runs in one folder
+    """I/N: train the I-th of N shares of the runs, I from 1, and write no report. The machines need
+    not share a folder: afterwards, copy all runs into one and use --report-only
     (docs/cluster.md)."""
     report_only: bool = False
     """Train nothing; report on the finished runs in --out and on --include."""
@@ -200,21 +200,22 @@ def run(
     """Trains and reports; says how to continue if a signal stops it."""
     try:
         left = [] if command.report_only else train_all(command, training, configs)
-        unfinished: Collection[Path] = left
         if command.shard is None:
             with stoppable(lambda: "finished evaluations are kept"):
                 unfinished = write_report(command.out, included, left)
+        else:
+            unfinished = sweep.unfinished(command.out)
     except SystemExit as stop:
         if isinstance(stop.code, int) and stop.code > SIGNALLED:
             console.print("run the same command again to continue the sweep")
         raise
     if left:
         console.print(f"left to other processes: {', '.join(folder.name for folder in left)}")
-    if missing := [folder.name for folder in left if folder in unfinished]:
-        console.print(f"not finished, and so in no report: {', '.join(missing)}")
+    if missing := [f.name for f in unfinished if command.report_only or f in left]:
+        console.print(f"not finished: {', '.join(missing)}")
         raise SystemExit(INCOMPLETE)
     if command.shard is not None:
-        console.print("when all shares are done:")
+        console.print("when all shares are done, and their runs lie in one folder:")
         console.print(f"tdanet sweep --out {shlex.quote(str(command.out))} --report-only")
 
 

@@ -93,7 +93,7 @@ def find_names(flag: str, given: Collection[str], known: Iterable[str]) -> list[
             similar = {each.lower(): each for each in names}
             near = difflib.get_close_matches(name.lower(), similar, n=1)
             hint = f"did you mean {similar[near[0]]}?" if near else f"there are {', '.join(names)}"
-            if Path(name).is_file():
+            if flag == "scenes" and Path(name).is_file():
                 hint = "rooms of your own are imported (tdanet scenes import) and given with --data"
             raise ValueError(f"--{flag} {name}: in no test episode; {hint}")
     return list(given) or names

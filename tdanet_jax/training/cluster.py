@@ -6,9 +6,10 @@ import os
 
 #: The address (HOST:PORT) of the first process, their number, and this process's own, from 0.
 ADDRESS, PROCESSES, PROCESS = "JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"
-#: Launchers that tell their processes who is who, by JAX's names, and the variable with the number
-#: of processes that they started. SLURM's is not set in a job script, but in each step (`srun`).
-LAUNCHERS = {"slurm": "SLURM_STEP_NUM_TASKS", "ompi": "OMPI_COMM_WORLD_SIZE"}
+#: Launchers that tell their processes who is who, by JAX's names and in its order (mpirun may run
+#: within SLURM), and the variable with the number of processes that they started. SLURM's is not
+#: set in a job script, but in each step (`srun`).
+LAUNCHERS = {"ompi": "OMPI_COMM_WORLD_SIZE", "slurm": "SLURM_STEP_NUM_TASKS"}
 
 
 def launcher() -> str | None:

@@ -96,7 +96,7 @@ def connect(count: int = 1) -> Mesh:
             raise ValueError(f"{error}; set {own} to say who is who") from None
     start()
     if jax.local_device_count() < count:
-        raise ValueError(f"--devices {count}: this machine has {jax.local_device_count()}")
+        raise ValueError(f"--devices {count}: this process has {jax.local_device_count()}")
     chosen: list[Any] = []
     for process in range(jax.process_count()):
         chosen += [d for d in jax.devices() if d.process_index == process][:count]
@@ -121,6 +121,7 @@ def _join_at(address: str) -> None:
         coordinator_address=address,
         num_processes=processes,
         process_id=process,
+        cluster_detection_method="deactivate",
     )
 
 
@@ -132,7 +133,7 @@ def _join(variable: str, **arguments: Any) -> None:
     try:
         jax.distributed.initialize(**arguments)
     except (RuntimeError, ValueError) as error:  # JAX's own errors, and those of a bad address
-        raise ValueError(f"{variable}: {_first_line(error)}") from None
+        raise ValueError(f"{variable}: {_first_line(error).rstrip('.')}") from None
 
 
 def first() -> Mesh:

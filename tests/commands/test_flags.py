@@ -221,7 +221,7 @@ def prepare_sweep(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.training.devices.connect")
     recorder.record("tdanet_jax.training.devices.check_divides")
     recorder.record("tdanet_jax.workflows.train.train", "tdanet_jax.workflows.train.train_together")
-    recorder.record("tdanet_jax.commands.sweep.write_report")
+    recorder.record("tdanet_jax.commands.sweep.write_report", gives=())
 
 
 def prepare_serve(recorder: Recorder) -> None:

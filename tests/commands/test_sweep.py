@@ -222,8 +222,7 @@ def test_a_run_of_another_process_is_left_to_it_and_the_sweep_goes_on(
         said = capsys.readouterr().out
         assert f"{out / '18-4-tdanet-seed1'}: another process trains it; skipped\n" in said
         assert said.endswith(
-            "left to other processes: 18-4-tdanet-seed1\n"
-            "not finished, and so in no report: 18-4-tdanet-seed1\n"
+            "left to other processes: 18-4-tdanet-seed1\nnot finished: 18-4-tdanet-seed1\n"
         )
         left_out = json.loads((out / "report.json").read_text())["left_out"]
         assert "Not finished: 18-4-tdanet-seed1." in left_out
@@ -231,6 +230,12 @@ def test_a_run_of_another_process_is_left_to_it_and_the_sweep_goes_on(
     assert trained[2:] == ["18-4-tdanet-seed1"]
     left_out = json.loads((out / "report.json").read_text())["left_out"]
     assert not any(line.startswith("Not finished") for line in left_out)
+    (out / "18-4-tdanet-seed2" / "results.json").unlink()  # begun, by another machine
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        sweep.main(["--report-only", "--out", str(out)])
+    assert ended.value.code == sweep.INCOMPLETE
+    assert capsys.readouterr().out.endswith("not finished: 18-4-tdanet-seed2\n")
 
 
 def test_a_sweep_whose_runs_are_all_in_other_processes_says_so(tmp_path, capsys, trained):

@@ -63,7 +63,7 @@ def test_an_update_on_eight_devices_is_the_update_on_one():
 
 def test_more_devices_than_there_are_is_one_clear_error():
     present = jax.local_device_count()  # this process uses its CPU already
-    with pytest.raises(ValueError, match=f"--devices {present + 1}: this machine has {present}"):
+    with pytest.raises(ValueError, match=f"--devices {present + 1}: this process has {present}"):
         devices.connect(present + 1)
     with pytest.raises(ValueError, match="--devices 0: must be positive"):
         devices.connect(0)
@@ -142,7 +142,8 @@ def test_a_jax_that_cannot_be_started_is_one_clear_error(monkeypatch, platform, 
 def test_processes_that_cannot_join_are_one_clear_error(
     monkeypatch, address, processes, process, what
 ):
-    def initialize(**arguments):
+    def initialize(cluster_detection_method, **arguments):
+        assert cluster_detection_method == "deactivate"  # also within a launcher
         raise RuntimeError("no answer\nmore")
 
     monkeypatch.setattr(jax.distributed, "initialize", initialize)
@@ -167,7 +168,9 @@ def test_a_launcher_says_who_is_who(monkeypatch):
                 devices.connect()
             assert heard == [{"cluster_detection_method": name}] * several
         heard.clear()
-    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "2")
+    for variable in cluster.LAUNCHERS.values():  # mpirun in a step of SLURM
+        monkeypatch.setenv(variable, "2")
+    assert cluster.launcher() == "ompi"
     cluster.leave()
     devices.connect()
     assert heard == []

@@ -120,6 +120,8 @@ def _places(folder: Path) -> dict[str, tuple[str, str]]:
         try:
             parts = [part["key"] for part in entry["key_metadata"]]
             if entry["value_metadata"]["value_type"] not in _EMPTY:
+                if "/".join(parts) in ("file", "allow_pickle"):  # arguments of np.savez
+                    raise FileError(folder / METADATA, f"{parts[0]} is not the name of an array")
                 found["/".join(parts)] = driver, ".".join(parts)
         except (KeyError, TypeError):
             raise FileError(folder / METADATA, "an array without key and value type") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import tempfile
 from pathlib import Path
@@ -92,3 +93,11 @@ def test_faults_that_are_found_later_name_the_checkpoint(monkeypatch: pytest.Mon
     match = "checkpoints/2/state: not an npz archive"
     with pytest.raises(FileError, match=match), orbax.as_npz(STATE) as file:
         npz.read(file)
+
+
+@pytest.mark.parametrize("name", ["file", "allow_pickle"])
+def test_a_name_that_numpy_takes_for_an_argument_is_refused(tmp_path: Path, name: str) -> None:
+    key = {"key_metadata": [{"key": name}], "value_metadata": {"value_type": "jax.Array"}}
+    (tmp_path / orbax.METADATA).write_text(json.dumps({"tree_metadata": {"x": key}}))
+    with pytest.raises(FileError, match=f"{name} is not the name of an array"):
+        orbax._places(tmp_path)
