@@ -207,8 +207,8 @@ def make_task(
         model needs feature maps and there are none.
     """
     tables, split = _split(config, Rooms(tables, extras))
-    unnamed = _without_words(tables, split, vectors)
-    tables = zero_shot.hide_classes(tables, unnamed)
+    if unnamed := _without_words(tables, split, vectors):
+        tables = zero_shot.hide_classes(tables, unnamed)
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
     adjacency = None if extras is None else extras.class_graph(tables.classes)
     if adjacency is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 from matplotlib.image import imread
 from PIL import Image, ImageSequence
 
@@ -28,6 +29,7 @@ def test_every_player_has_a_panel(some_rooms, tmp_path):
     assert orange[:, wide // 2 :].sum() > 100
 
 
+@pytest.mark.slow
 def test_an_animation_has_a_frame_for_each_step_and_stays_at_the_end(some_rooms, tmp_path):
     plan, made = floor_plan.of_room(some_rooms, "FloorPlan229"), walk(some_rooms, True)
     short = dataclasses.replace(made, pose=made.pose[:3], actions=np.array([0, 5]))

@@ -166,20 +166,15 @@ PHASES: tuple[tuple[Any, str, str], ...] = (
 )
 
 
-@pytest.mark.parametrize(
-    "phases",
-    [PHASES[2:3], pytest.param(PHASES, marks=pytest.mark.slow)],
-    ids=["compiling", "all phases"],
-)
+@pytest.mark.slow
 def test_a_signal_in_any_phase_ends_in_one_line_and_the_run_goes_on(
     ithor: Any,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
-    phases: tuple[tuple[Any, str, str], ...],
 ) -> None:
     out = tmp_path / "run"
-    for number, (place, name, message) in enumerate(phases):
+    for number, (place, name, message) in enumerate(PHASES):
         sent = (signal.SIGTERM, signal.SIGINT)[number % 2]
         original = getattr(place, name)
 
@@ -196,12 +191,9 @@ def test_a_signal_in_any_phase_ends_in_one_line_and_the_run_goes_on(
         assert captured.err == ""
         assert captured.out.splitlines()[-1].startswith(message)
         assert out.exists() == (place is not training)
-    if phases != PHASES:
-        monkeypatch.setattr(training, "_report", lambda *_: None)  # to save time
     assert ends("--resume", out) is None
     assert_trained(out)
-    if phases == PHASES:
-        assert json.loads((out / "results.json").read_text())["steps"] == 1200
+    assert json.loads((out / "results.json").read_text())["steps"] == 1200
 
 
 #: Sends a signal when a module is about to be imported, and tells at the end what was imported.
