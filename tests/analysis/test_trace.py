@@ -51,7 +51,7 @@ def triangulating_player(some_rooms, glove, tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "who", ["player", pytest.param("triangulating_player", marks=pytest.mark.slow)]
+    "who", [pytest.param("player", marks=pytest.mark.slow), "triangulating_player"]
 )
 def test_sampled_episodes_come_from_the_probabilities_and_the_stream_of_the_evaluation(
     some_rooms, who, chosen, request
