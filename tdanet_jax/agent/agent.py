@@ -18,7 +18,7 @@ import numpy as np
 
 from tdanet_jax import config as configs
 from tdanet_jax import words
-from tdanet_jax.agent.base import BaseAgent, Decision
+from tdanet_jax.agent.base import BaseAgent, Decision, softmax, without
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors
 from tdanet_jax.env.types import Observation
@@ -313,10 +313,8 @@ def _decision(
     logits = np.asarray(out.logits)[0]
     probabilities = np.asarray(state.recurrent.prev_action_probs)[0]
     if forbidden:
-        logits = np.array(logits)
-        logits[[*forbidden]] = -np.inf
-        probabilities = np.exp(logits - logits.max())
-        probabilities /= probabilities.sum()
+        logits = without(logits, forbidden)
+        probabilities = softmax(logits)
     action = Action(int(np.argmax(logits) if key is None else _sample(key, logits)))
     decision = Decision(
         action=action,

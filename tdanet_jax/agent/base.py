@@ -28,6 +28,19 @@ class Decision(NamedTuple):
     attention: np.ndarray | None  # [n], weight of each detection; None if the model has none
 
 
+def softmax(x: np.ndarray) -> np.ndarray:
+    """Probabilities from logits, [n]."""
+    exponentials = np.exp(x - x.max())
+    return exponentials / exponentials.sum()
+
+
+def without(logits: np.ndarray, forbidden: Collection[Action]) -> np.ndarray:
+    """The logits of the actions, [6], -inf for those that are forbidden."""
+    allowed = logits.copy()
+    allowed[[*forbidden]] = -np.inf
+    return allowed
+
+
 class BaseAgent:
     """What labels mean to an agent, and what it is shown of a frame.
 

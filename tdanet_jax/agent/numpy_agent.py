@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tdanet_jax import words
-from tdanet_jax.agent.base import BaseAgent, Decision
+from tdanet_jax.agent.base import BaseAgent, Decision, softmax, without
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.io.untrusted import FileError, npz
 from tdanet_jax.labels import Synonyms
@@ -145,11 +145,10 @@ class NumPyAgent(BaseAgent):
         action_features = _relu(self._layer("action_embedding", state.probabilities))
         hidden, cell = self._lstm(features, action_features, state.hidden, state.cell)
         logits = self._layer("actor", hidden)
-        probabilities = shown = _softmax(logits)
+        probabilities = shown = softmax(logits)
         if forbidden:
-            logits = logits.copy()
-            logits[[*forbidden]] = -np.inf
-            shown = _softmax(logits)
+            logits = without(logits, forbidden)
+            shown = softmax(logits)
         action = int(np.argmax(logits))
         if key is not None:
             action = int(key.choice(NUM_ACTIONS, p=shown / shown.sum(dtype=float)))
@@ -193,7 +192,7 @@ class NumPyAgent(BaseAgent):
         inputs = np.zeros((len(labels), len(target.query)), np.float32)  # [n, F + D]
         for row, label, box in zip(inputs, labels.tolist(), boxes, strict=True):
             row[: len(box)], row[len(box) :] = box, self._word(label)
-        attention = _softmax(inputs @ target.query) if len(inputs) else np.zeros(0, np.float32)
+        attention = softmax(inputs @ target.query) if len(inputs) else np.zeros(0, np.float32)
         difference = np.abs(self._branch(attention @ inputs) - target.reference)
         third = _relu(self._layer("encoder/linear3", difference))
         return attention, _relu(self._layer("encoder/linear4", third))
@@ -302,8 +301,3 @@ def _relu(x: np.ndarray) -> np.ndarray:
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
     return (1 + np.tanh(x / 2)) / 2  # for large x of either sign, too
-
-
-def _softmax(x: np.ndarray) -> np.ndarray:
-    exponentials = np.exp(x - x.max())
-    return exponentials / exponentials.sum()

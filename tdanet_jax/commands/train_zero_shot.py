@@ -57,7 +57,7 @@ def check(command: Command) -> TrainConfig:
         config.check()
         config = config.normalised()
         if command.out is None and cluster.several():
-            fail("a run of several processes needs --out: a folder that all of them can reach")
+            fail("a run of several processes needs --out, a folder that all of them can access")
     check_positive(devices=command.devices)
     for name in command.sinks:
         package = SINKS[name][0]

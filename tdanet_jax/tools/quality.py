@@ -6,11 +6,10 @@ import dataclasses
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
 
 from tdanet_jax.config import TrainConfig
-from tdanet_jax.evaluation import episodes, metrics, paper, policies, report, rollout
-from tdanet_jax.task import Task, load_task
+from tdanet_jax.evaluation import episodes, metrics, paper, policies, rollout
+from tdanet_jax.task import load_task
 from tdanet_jax.tools.benchmarking import Row, tdanet_forward_macs
 from tdanet_jax.training.run import Run
 
@@ -91,7 +90,10 @@ def quality_row(config: TrainConfig) -> Row:
                     policy, run.state.params, task.eval_params, lists, SEED
                 )
                 evaluating += time.perf_counter() - paused
-                yield {group: _rates(task, *one) for group, one in played.items()}, _spent(run)
+                yield (
+                    {group: _rates(records) for group, (_, records) in played.items()},
+                    _spent(run),
+                )
 
     with tempfile.TemporaryDirectory() as folder:
         run = Run(folder, dataclasses.replace(config, history=0), task)
@@ -101,18 +103,17 @@ def quality_row(config: TrainConfig) -> Row:
         "seed": config.seed,
         "passed": passed,
         **spent,
-        **{f"{group}_sr": sr for group, (sr, _) in figures.items()},
-        **{f"{group}_spl": spl for group, (_, spl) in figures.items()},
+        **{f"{group}_sr": round(sr, 2) for group, (sr, _) in figures.items()},
+        **{f"{group}_spl": round(spl, 2) for group, (_, spl) in figures.items()},
         "evaluation_seconds": round(evaluating, 1),
         "all_seconds": round(time.perf_counter() - began, 1),
     }
 
 
-def _rates(task: Task, chosen: episodes.Episodes, records: rollout.Records) -> tuple[float, float]:
-    """SR and SPL in percent, L >= 1."""
-    column = report.columns(task.tables, chosen, records)
-    rates: Any = metrics.summarise(*(column[name] for name in metrics.COLUMNS))["L>=1"]
-    return rates["SR"], rates["SPL"]
+def _rates(records: rollout.Records) -> tuple[float, float]:
+    """SR and SPL in percent, L >= 1: of all episodes."""
+    efficiency = metrics.spl(records.success, records.shortest, records.length)
+    return 100 * float(records.success.mean()), 100 * float(efficiency.mean())
 
 
 def _spent(run: Run) -> Row:

@@ -21,7 +21,7 @@ def launcher() -> str | None:
 
 
 def several() -> bool:
-    """Whether this process is one of several."""
+    """Whether other processes take part in the same run."""
     return bool(os.environ.get(ADDRESS)) or launcher() is not None
 
 

@@ -31,7 +31,7 @@ from tests.support.handmade import FRAME
 
 SPLITS = [("18/4", False), ("14/8", False), ("18/4", True), ("Bread,Mug,Towel", True)]
 NAMES = ["18/4", "14/8", "18/4-validation", "own-validation"]
-#: A split of the paper, and one of one's own on validation; the others are slow.
+#: One of the paper's splits, and a custom one on validation; the others are slow.
 OF_EACH_KIND = [
     pytest.param(split, id=name, marks=() if name in (NAMES[0], NAMES[3]) else pytest.mark.slow)
     for split, name in zip(SPLITS, NAMES, strict=True)

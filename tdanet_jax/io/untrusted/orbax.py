@@ -1,7 +1,7 @@
 """Arrays of checkpoints in formats 1 and 2, which Orbax wrote, read in a process of its own.
 
-TensorStore, which reads them, crashes on some damaged ones. The process that asks for them then
-goes on, and all that the other one wrote is read as any untrusted npz.
+TensorStore, which reads them, crashes on some damaged ones. A crash ends that process alone, and
+what it writes is read like any untrusted npz file.
 """
 
 from __future__ import annotations
