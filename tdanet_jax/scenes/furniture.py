@@ -104,7 +104,9 @@ def _unit(scene: Scene, name: str) -> list[SceneObject]:
     [piece] = [item for item in scene.objects if item.object_id == name]
 
     def belongs(item: SceneObject) -> bool:
-        return np.isfinite(item.box).all() and (holds(piece.box, item.box) or _is_on(item, piece))
+        return bool(np.isfinite(item.box).all()) and (
+            holds(piece.box, item.box) or _is_on(item, piece)
+        )
 
     base = {item.object_id for item in scene.objects if item is piece or belongs(item)}
     return [item for item in scene.objects if _rests_on(item, base, support)]
