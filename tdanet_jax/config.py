@@ -65,9 +65,6 @@ class LearnerConfig:
     """Weight of the entropy at the end of the budget; changes linearly."""
     value_weight: float = 0.5
     """Weight of the value loss, the squared error."""
-    privileged_critic: bool = False
-    """In training, a second critic is told how far away the target is, and advantages are relative
-    to its values. Not in the paper; the agent is told nothing more (docs/method.md)."""
     step_limit: int = 50
     """Actions after which a training episode is truncated."""
     partial_reward: Literal["parents", "similarity", "none"] = "parents"

@@ -191,15 +191,6 @@ def move(pose: jax.Array, action: jax.Array, params: EnvParams) -> jax.Array:
     return params.grid.join(position, *odometry.turn(params.grid, rotation, horizon, action))
 
 
-def distances_after(state: EnvState, params: EnvParams) -> jax.Array:
-    """Actions to the target, without Done, from where each action leads: [6] int32.
-
-    -1 where it is out of reach. Of an action that changes nothing, as Done: from the state itself.
-    """
-    poses = jax.vmap(move, (None, 0, None))(state.pose, jnp.arange(NUM_ACTIONS), params)
-    return params.distance[poses, state.target].astype(jnp.int32)
-
-
 def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome:
     """One action, without any reset. The reward is one of four values, as in the paper's Eq. 3.
 

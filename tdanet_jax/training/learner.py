@@ -21,8 +21,7 @@ from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import EnvParams, EnvState, Observation
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.activation_cache import ACTIVATIONS
-from tdanet_jax.models.actor_critic import ActorCritic, Output, RecurrentState
-from tdanet_jax.training import privileged
+from tdanet_jax.models.actor_critic import ActorCritic, RecurrentState
 from tdanet_jax.training.gae import advantages
 
 #: Kernels with more weights than this are cast to the network's precision once per rollout.
@@ -44,7 +43,6 @@ class TrainState(struct.PyTreeNode):
     updates: jax.Array  # int32, updates done
     episodes: jax.Array  # int32, training episodes finished
     skipped: jax.Array  # int32, updates skipped because the loss or gradient was not finite
-    critic: privileged.CriticState | None = None  # of `LearnerConfig.privileged_critic`
 
 
 class Rollout(NamedTuple):
@@ -57,11 +55,7 @@ class Rollout(NamedTuple):
     activations: Any
     action: jax.Array
     log_prob: jax.Array
-    value: jax.Array  # the agent's own
-    known: jax.Array | None  # what the privileged critic is told
-    baseline: (
-        jax.Array
-    )  # the value that advantages are relative to: the privileged critic's, if any
+    value: jax.Array
     reward: jax.Array
     terminal: jax.Array  # no bootstrap after this step
     bootstrap_only: jax.Array  # the step only valued the last state of a truncated episode
@@ -94,11 +88,10 @@ def init(
     """The state of a run before its first update."""
     model_key, env_key, run_key = jax.random.split(key, 3)
     weights = model.initialise(model_key, words)
-    batch, optimizer = config.num_envs, make_optimizer(config)
-    critic_key = jax.random.fold_in(model_key, 1)
+    batch = config.num_envs
     return TrainState(
         params=weights,
-        opt_state=optimizer.init(weights),
+        opt_state=make_optimizer(config).init(weights),
         env_state=_reset(env_key, params, batch),
         bootstrap_only=jnp.zeros(batch, bool),
         recurrent=actor_critic.initial_state(model, weights, batch, training=True),
@@ -106,7 +99,6 @@ def init(
         updates=jnp.zeros((), jnp.int32),
         episodes=jnp.zeros((), jnp.int32),
         skipped=jnp.zeros((), jnp.int32),
-        critic=privileged.init(critic_key, optimizer) if config.privileged_critic else None,
     )
 
 
@@ -125,7 +117,7 @@ def rollout(
     """T steps of every environment.
 
     Returns:
-      The state after it, what happened, and the baseline of each last state [B].
+      The state after it, what happened, and the value of each last state [B].
     """
     observe = jax.vmap(dynamics.observe, (0, None))
     transition = jax.vmap(dynamics.transition, (0, 0, None))
@@ -136,12 +128,6 @@ def rollout(
     class_table = actor_critic.prepare(model, state.params, words)
     rate = model.encoder.dropout
     batch, units = config.num_envs, model.encoder.dropout_units
-
-    def judge(state: TrainState, out: Output) -> tuple[jax.Array | None, jax.Array]:
-        if state.critic is None:
-            return None, out.value
-        known = privileged.inputs(state.env_state, params, out)
-        return known, privileged.value(state.critic, known)
 
     def act(state: TrainState, step_key: jax.Array) -> tuple[TrainState, Rollout]:
         action_key, dropout_key, reset_key = jax.random.split(step_key, 3)
@@ -158,7 +144,6 @@ def rollout(
         valued_next = truncated if config.bootstrap_truncated else jnp.zeros_like(truncated)
         terminal = only | terminated | (truncated & ~valued_next)
         begun = _reset(reset_key, params, batch)
-        known, baseline = judge(state, out)
         step = Rollout(
             obs=obs,
             prev_action_probs=state.recurrent.prev_action_probs,
@@ -168,8 +153,6 @@ def rollout(
             action=action,
             log_prob=jnp.take_along_axis(log_probs, action[:, None], -1)[:, 0],
             value=out.value,
-            known=known,
-            baseline=baseline,
             reward=jnp.where(only, 0.0, moved.reward),
             terminal=terminal,
             bootstrap_only=only,
@@ -190,7 +173,7 @@ def rollout(
     after, steps = jax.lax.scan(act, state, jax.random.split(key, config.rollout_steps))
     obs = observe(after.env_state, params)
     _, out, _ = actor_critic.act(model, weights, class_table, after.recurrent, obs)
-    return after, steps, judge(after, out)[1]
+    return after, steps, out.value
 
 
 def _dropout_mask(key: jax.Array, rate: float, shape: tuple[int, ...]) -> jax.Array:
@@ -227,7 +210,7 @@ def loss(
     log_prob = jnp.take_along_axis(log_probs, steps.action[..., None], -1)[..., 0]
     entropy = mean(-jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1))
     policy_loss = -mean(log_prob * advantage)
-    value_loss = mean(0.5 * (steps.baseline + advantage - out.value) ** 2)
+    value_loss = mean(0.5 * (steps.value + advantage - out.value) ** 2)
     total = policy_loss + config.value_weight * value_loss - entropy_weight * entropy
     parts = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
     return total, parts
@@ -251,10 +234,10 @@ def update(
       The run after it, and sums and means to log.
     """
     key = jax.random.fold_in(state.key, state.updates)
-    after, steps, last_baseline = rollout(state, key, config, model, words, params)
+    after, steps, last_value = rollout(state, key, config, model, words, params)
     advantage = advantages(
-        steps.reward, steps.baseline, last_baseline, steps.terminal, steps.bootstrap_only,
-        config.gamma, config.gae_lambda,
+        steps.reward, steps.value, last_value, steps.terminal, steps.bootstrap_only, config.gamma,
+        config.gae_lambda,
     )  # fmt: skip
 
     def mix(start: float, end: float) -> jax.Array:
@@ -266,24 +249,18 @@ def update(
     )
     grad_norm = optax.tree.norm(grads)
     finite = jnp.isfinite(total) & jnp.isfinite(grad_norm)
-    optimizer = make_optimizer(config)
-    scaled, opt_state = optimizer.update(grads, state.opt_state, state.params)
+    scaled, opt_state = make_optimizer(config).update(grads, state.opt_state, state.params)
     rate = mix(config.learning_rate, config.final_learning_rate)
     weights = jax.tree.map(lambda p, g: p - rate * g, state.params, scaled)
-    critic = state.critic
-    if critic is not None and steps.known is not None:
-        returns, counted = steps.baseline + advantage, ~steps.bootstrap_only
-        critic = privileged.update(critic, steps.known, returns, counted, optimizer, rate)
     # A non-finite loss or gradient must not reach the parameters: the update is skipped, counted.
-    weights, opt_state, critic = jax.tree.map(
+    weights, opt_state = jax.tree.map(
         lambda new, old: jnp.where(finite, new, old),
-        (weights, opt_state, critic),
-        (state.params, state.opt_state, state.critic),
+        (weights, opt_state),
+        (state.params, state.opt_state),
     )
     after = after.replace(
         params=weights,
         opt_state=opt_state,
-        critic=critic,
         updates=state.updates + 1,
         episodes=state.episodes + steps.done.sum(),
         skipped=state.skipped + ~finite,
@@ -301,7 +278,7 @@ def _explained_variance(steps: Rollout, advantage: jax.Array) -> jax.Array:
     """1 - Var(return - value) / Var(return) over the steps that count; NaN if returns are alike."""
     counted = ~steps.bootstrap_only
     rest = jnp.var(advantage, where=counted)
-    return 1.0 - rest / jnp.var(steps.baseline + advantage, where=counted)
+    return 1.0 - rest / jnp.var(steps.value + advantage, where=counted)
 
 
 def _episode_sums(steps: Rollout) -> dict[str, jax.Array]:

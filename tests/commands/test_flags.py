@@ -568,8 +568,6 @@ SHOWN = {
     "_gradient_of_the_loss",
     "bootstrap_truncated": "training/test_learner.py::test_rollouts_follow_the_slow_world_and_value"
     "_time_outs_in_one_more_step",
-    "privileged_critic": "training/test_privileged.py::test_without_it_advantages_are_relative_to_"
-    "the_agents_own_values",
     "image": "commands/test_pictures_of_runs.py::test_a_model_that_was_trained_on_feature_maps"
     "_sees_those_of_the_rooms",
     "steps": "training/test_run.py::test_the_budget_in_steps_is_kept_and_every_chunk_has_a_row",

@@ -255,7 +255,7 @@ def test_perturbing_all_hidden_data_changes_no_parameter(
     rooms: SceneTables, glove: WordVectors, model: str, paid: Any
 ) -> None:
     config = config_of("18/4", False)
-    paying = dataclasses.replace(config.learner, partial_reward=paid, privileged_critic=True)
+    paying = dataclasses.replace(config.learner, partial_reward=paid)
     config = dataclasses.replace(config, model=model, learner=paying)
     hidden = make_split("18/4").hidden
     noisy = perturbed(rooms, hidden, seed=2)

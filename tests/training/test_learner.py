@@ -22,7 +22,7 @@ from tdanet_jax.models.actor_critic import ActorCritic, Output
 from tdanet_jax.models.lstm import Carry
 from tdanet_jax.models.tdanet import TDANetEncoder
 from tdanet_jax.observation_spec import ObservationSpec
-from tdanet_jax.training import learner, privileged
+from tdanet_jax.training import learner
 from tdanet_jax.training.gae import advantages
 from tdanet_jax.training.learner import Rollout, TrainState
 from tests.support import handmade, oracle
@@ -60,9 +60,8 @@ TABLES = house()
 WORDS = jnp.asarray(np.random.default_rng(0).normal(size=(len(CLASSES), 4)), jnp.float32)
 MODEL = ActorCritic(TDANetEncoder(width=12, dropout=0.25), hidden=8)
 CONFIG = LearnerConfig(
-    num_envs=B, rollout_steps=T, learning_rate=9e-4, adam_epsilon=1e-5, entropy_weight=0.01,
-    final_entropy_weight=0.002, privileged_critic=True,
-)  # fmt: skip
+    num_envs=B, rollout_steps=T, learning_rate=9e-4, adam_epsilon=1e-5, final_entropy_weight=0.002
+)
 
 
 def house_params(spec: ObservationSpec) -> EnvParams:
@@ -118,7 +117,7 @@ def forward(
 
 def advantages_of(steps: Rollout, last: jax.Array) -> jax.Array:
     flags = (steps.terminal, steps.bootstrap_only)
-    return advantages(steps.reward, steps.baseline, last, *flags, CONFIG.gamma, CONFIG.gae_lambda)
+    return advantages(steps.reward, steps.value, last, *flags, CONFIG.gamma, CONFIG.gae_lambda)
 
 
 @pytest.mark.parametrize("bootstrap", [True, pytest.param(False, marks=pytest.mark.slow)])
@@ -203,12 +202,11 @@ def test_recorded_values_and_probabilities_are_those_of_the_network() -> None:
     close = {"rtol": 1e-4, "atol": 1e-5}
     chex.assert_trees_all_close((steps.value, steps.log_prob), (out.value, log_prob), **close)
     chex.assert_trees_all_close(after.recurrent.carry, carry, **close)
-    # The last baseline is of the state that the next rollout starts from, without dropout.
+    # The last value is of the state that the next rollout starts from, without dropout.
     obs = jax.vmap(dynamics.observe, (0, None))(after.env_state, PARAMS)
     rest = (obs, after.recurrent.prev_action_probs, after.recurrent.is_first)
     _, out = forward(before.params, after.recurrent.carry, *rest)
-    known = jax.jit(privileged.inputs)(after.env_state, PARAMS, out)
-    chex.assert_trees_all_close(last, privileged.value(before.critic, known), **close)
+    chex.assert_trees_all_close(last, out.value, **close)
 
 
 def test_carries_cross_the_borders_of_rollouts() -> None:
@@ -304,7 +302,7 @@ def test_the_loss_is_the_one_that_is_documented() -> None:
             p = np.exp(logits[t, b]) / np.exp(logits[t, b]).sum()
             advantage_tb = float(advantage[t, b])
             policy -= np.log(p[int(steps.action[t, b])]) * advantage_tb
-            critic += 0.5 * (float(steps.baseline[t, b]) + advantage_tb - value[t, b]) ** 2
+            critic += 0.5 * (float(steps.value[t, b]) + advantage_tb - value[t, b]) ** 2
             entropy -= (p * np.log(p)).sum()
     assert 0 < count < T * B, "the rollout should hold both kinds of steps"
     assert float(parts["policy_loss"]) == pytest.approx(policy / count, rel=1e-4)
@@ -321,7 +319,6 @@ def test_bootstrap_only_steps_do_not_count() -> None:
     other = steps._replace(
         action=jnp.where(only, (steps.action + 1) % 6, steps.action),
         value=jnp.where(only, 100.0, steps.value),
-        baseline=jnp.where(only, 100.0, steps.baseline),
         reward=jnp.where(only, 50.0, steps.reward),
     )
     chex.assert_trees_all_equal(
@@ -420,7 +417,7 @@ def test_the_explained_variance_is_that_of_the_returns_that_count() -> None:
     _, steps, last = rollout(state, key, CONFIG, MODEL, WORDS, PARAMS)
     advantage = np.asarray(advantages_of(steps, last))
     counted = ~np.asarray(steps.bootstrap_only)
-    returns = (np.asarray(steps.baseline) + advantage)[counted]
+    returns = (np.asarray(steps.value) + advantage)[counted]
     _, metrics = update(state, progress, CONFIG, MODEL, WORDS, PARAMS)
     expected = 1 - advantage[counted].var() / returns.var()
     assert float(metrics["explained_variance"]) == pytest.approx(expected, rel=1e-3, abs=1e-4)
@@ -468,8 +465,7 @@ def test_a_gradient_that_is_not_finite_skips_the_update_and_is_counted(fault: st
         words = WORDS.at[0].set(jnp.nan)
     after, metrics = update(state, jnp.float32(0), CONFIG, MODEL, words, params)
     assert not np.isfinite(float(metrics["grad_norm"]))
-    for part in ("params", "opt_state", "critic"):
-        chex.assert_trees_all_equal(getattr(after, part), getattr(state, part))
+    chex.assert_trees_all_equal((after.params, after.opt_state), (state.params, state.opt_state))
     assert int(after.skipped) == 1
     assert int(after.updates) == 2
     assert int(after.episodes) > int(state.episodes)

@@ -27,7 +27,7 @@ TINY = TrainConfig(
     steps=640,
     history=8,
     chunk_updates=2,
-    learner=LearnerConfig(num_envs=8, rollout_steps=5, step_limit=6, privileged_critic=True),
+    learner=LearnerConfig(num_envs=8, rollout_steps=5, step_limit=6),
     network=NetworkConfig(width=16, hidden=16),
 )
 TIMES = {"seconds", "steps_per_second"}
