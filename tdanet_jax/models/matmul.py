@@ -28,24 +28,15 @@ def dot_rows(a: jax.Array, b: jax.Array, dtype: Any) -> jax.Array:
     """The sum over rows of the outer products of a [..., n] and b [..., m], [n, m]; as `dot`.
 
     Time and environments stay separate axes: devices that share the environments would have to
-    exchange all of them if the axes were merged. On a CPU the sum goes step by step along the first
-    axis, usually time: the operands of a step fit into the processor's caches.
+    exchange all of them if the axes were merged.
     """
-
-    def over_rows(a: jax.Array, b: jax.Array) -> jax.Array:
-        rows = tuple(range(a.ndim - 1))
-        a, b = a.astype(dtype), b.astype(dtype)
-        return jax.lax.dot_general(
-            a, b, ((rows, rows), ((), ())), preferred_element_type=jnp.float32
-        )
-
-    if a.ndim <= 2 or jax.default_backend() != "cpu":
-        return over_rows(a, b)
-
-    def add(total: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
-        return total + over_rows(*step), None
-
-    return jax.lax.scan(add, jnp.zeros((a.shape[-1], b.shape[-1])), (a, b))[0]
+    rows = tuple(range(a.ndim - 1))
+    return jax.lax.dot_general(
+        a.astype(dtype),
+        b.astype(dtype),
+        ((rows, rows), ((), ())),
+        preferred_element_type=jnp.float32,
+    )
 
 
 def pack(x: jax.Array) -> jax.Array:

@@ -152,30 +152,15 @@ def make(
     return ActorCritic(encoder, hidden=config.hidden, dtype=dtype)
 
 
-@jax.custom_vjp
 def pool(weights: jax.Array, classes: jax.Array, words: jax.Array) -> jax.Array:
     """The weighted sum of the word vectors of the detections' classes.
 
     Args:
       weights: [..., K].
       classes: [..., K] int32.
-      words: [C, D], constants without a gradient.
+      words: [C, D].
 
     Returns:
       [..., D].
     """
     return jnp.einsum("...k,...kd->...d", weights, words[classes])
-
-
-def _pool_fwd(weights: jax.Array, classes: jax.Array, words: jax.Array) -> tuple[jax.Array, tuple]:
-    return pool(weights, classes, words), (classes, words)
-
-
-def _pool_bwd(saved: tuple, cotangent: jax.Array) -> tuple:
-    """One product with the words of all classes, then a look-up per detection."""
-    classes, words = saved
-    by_class = cotangent @ words.T  # [..., C]
-    return jnp.take_along_axis(by_class, classes, axis=-1), None, None
-
-
-pool.defvjp(_pool_fwd, _pool_bwd)
