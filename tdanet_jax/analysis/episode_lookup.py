@@ -60,7 +60,7 @@ def find(
         raise ValueError(f"{scene}: no such room; there are {name_ranges(tables.scenes)}")
     index = tables.scenes.index(scene)
     level = tables.grid.look_level(np.flatnonzero(tables.position_scene == index))
-    within = (tables.distance[level] >= 0).any(axis=0)
+    within = tables.distance[level].max(axis=0, initial=-1) >= 0
     found = sorted(name for name, ok in zip(tables.targets, within, strict=True) if ok)
     if target not in tables.targets:
         target = Labels(tables.classes).find(target) or target
