@@ -20,6 +20,7 @@ COMMANDS = {
     "replay": ("replay", "writes an episode as an interactive page"),
     "trajectories": ("trajectories", "draws the paths of agents on the floor plan"),
     "attention": ("attention", "shows what an agent attends to"),
+    "failures": ("failures", "sorts failed episodes by cause, with pages of some"),
     "scenes": ("scenes", "builds, imports, exports, varies, checks and draws rooms"),
     "serve": ("serve", "answers a robot's frames with actions, in lines of JSON"),
     "export": ("export", "makes a folder of an agent for robots without JAX"),

@@ -1,4 +1,4 @@
-"""Looks up one episode: by room, target and start, or in the records of a run."""
+"""Looks up episodes: one by room, target and start, or those that a run has recorded."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from tdanet_jax.evaluation.report import EPISODES_FILE
 from tdanet_jax.io.untrusted import FileError, jsons, regular
 from tdanet_jax.labels import Labels
 from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.splits import GROUPS
 from tdanet_jax.vocabulary import ACTION_NAMES
 
 #: How far from a start the nearest reachable point may be, in metres.
@@ -38,6 +39,7 @@ class Recorded(NamedTuple):
 
     episode: Episodes
     actions: np.ndarray  # [T] int
+    group: str  # "seen" or "unseen"
 
 
 def find(
@@ -57,9 +59,11 @@ def find(
     if scene not in tables.scenes:
         raise ValueError(f"{scene}: no such room; there are {name_ranges(tables.scenes)}")
     index = tables.scenes.index(scene)
-    within = tables.distance[tables.state_scene == index].max(axis=0, initial=-1) >= 0
+    level = tables.grid.look_level(np.flatnonzero(tables.position_scene == index))
+    within = tables.distance[level].max(axis=0, initial=-1) >= 0
     found = sorted(name for name, ok in zip(tables.targets, within, strict=True) if ok)
-    target = Labels(tables.classes).find(target) or target
+    if target not in tables.targets:
+        target = Labels(tables.classes).find(target) or target
     if target not in found:
         raise ValueError(
             f"{target}: no target that can be seen in {scene}; there: {', '.join(found) or 'none'}"
@@ -97,24 +101,45 @@ def read_record(run: Path | str, index: int, tables: SceneTables) -> Recorded:
     Raises:
       ValueError: there is no such episode, or it does not belong to these tables.
     """
-    path = Path(run) / EPISODES_FILE
-    try:
-        lines = regular.read_text(path, links=False).splitlines()
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; a run writes it when training ends") from None
+    path, lines = _lines(run)
     if not 0 <= index < len(lines):
         raise ValueError(f"{path}: no episode {index}; there are 0 to {len(lines) - 1}")
-    where = f"{path}, line {index + 1}"
-    row = jsons.parse(where, lines[index])
+    return _parse(path, index, lines[index], tables)
+
+
+def read_records(run: Path | str, tables: SceneTables) -> list[Recorded]:
+    """All episodes of a run's `episodes.jsonl`, in its order.
+
+    Raises:
+      ValueError: there are none, or one does not belong to these tables.
+    """
+    path, lines = _lines(run)
+    if not lines:
+        raise ValueError(f"{path}: no episodes")
+    return [_parse(path, index, line, tables) for index, line in enumerate(lines)]
+
+
+def _lines(run: Path | str) -> tuple[Path, list[str]]:
+    """The file of a run's records, and its lines."""
+    path = Path(run) / EPISODES_FILE
     try:
-        return _parse(where, row, tables)
+        return path, regular.read_text(path, links=False).splitlines()
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file; a run writes it when training ends") from None
+
+
+def _parse(path: Path, index: int, line: str, tables: SceneTables) -> Recorded:
+    where = f"{path}, line {index + 1}"
+    row = jsons.parse(where, line)
+    try:
+        return _recorded(where, row, tables)
     except FileError:
         raise
     except ValueError as error:
         raise FileError(where, error) from None
 
 
-def _parse(where: str, row: Any, tables: SceneTables) -> Recorded:
+def _recorded(where: str, row: Any, tables: SceneTables) -> Recorded:
     if not isinstance(row, dict):
         raise FileError(where, "not the record of an episode")
     x, z, rotation, horizon, _ = (
@@ -124,9 +149,10 @@ def _parse(where: str, row: Any, tables: SceneTables) -> Recorded:
     for name in ("scene", "target"):
         if not isinstance(row.get(name), str):
             raise FileError(where, f"{name} is not text")
-    episode = find(
-        tables, row["scene"], row["target"], Start(x, z, round(rotation), round(horizon))
-    )
+    if row.get("group") not in GROUPS:
+        raise FileError(where, f"group is not one of {', '.join(GROUPS)}")
+    start = Start(x, z, round(rotation), round(horizon))
+    episode = find(tables, row["scene"], row["target"], start)
     if not isinstance(row.get("actions"), list):
         raise FileError(where, "actions is not a list")
     for name in row["actions"]:
@@ -139,4 +165,4 @@ def _parse(where: str, row: Any, tables: SceneTables) -> Recorded:
         raise ValueError("recorded on other scene tables")
     if not len(actions):
         raise ValueError("no actions")
-    return Recorded(episode, actions)
+    return Recorded(episode, actions, row["group"])

@@ -19,6 +19,7 @@ from matplotlib.ticker import FuncFormatter
 from tdanet_jax.analysis import drawing
 from tdanet_jax.analysis.attention import MIN_FRAMES, ClassPairs
 from tdanet_jax.analysis.drawing import BLUE, GREEN, MARKERS, ORANGE, PALETTE, SHADES
+from tdanet_jax.analysis.failures import CAUSES, METRES, METRES_NAMES, Summary
 from tdanet_jax.evaluation.comparison import MEASURES, Curve
 from tdanet_jax.io.escaping import in_figure
 from tdanet_jax.splits import GROUPS
@@ -29,6 +30,9 @@ _MEMORY = {
     "temporary_mb": ("s-", ORANGE, "rollout and activation cache"),
     "arguments_mb": ("^--", GREEN, "rooms, parameters, state"),
 }
+
+#: Of the causes of failures: blue and green with Done, the others at the step limit.
+_CAUSE_COLORS = (BLUE, PALETTE[6], GREEN, PALETTE[3], ORANGE, PALETTE[5])
 
 
 def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> None:
@@ -141,6 +145,57 @@ def noise(rows: Sequence[dict[str, Any]], title: str, path: Path) -> None:
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
     drawing.save(figure, path, DPI)
+
+
+def failures(summary: Summary, path: Path, most: int = 20) -> None:
+    """Failures by cause, the missing distance of those that said Done out of reach, and the targets
+    with most failures.
+
+    Args:
+      most: targets to draw.
+    """
+    targets = summary.targets()[:most]
+    high = max(4.4, 0.8 + 0.26 * len(targets))
+    figure = Figure(figsize=(13, high), layout="constrained")
+    grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.25))
+    causes, metres = (figure.add_subplot(grid[i, 0]) for i in (0, 1))
+    by_target = figure.add_subplot(grid[:, 1])
+    groups = [{"group": group} for group in summary.groups]
+    _draw_causes(causes, summary, groups, [*summary.groups])
+    unseen = ("*" if key["group"] == "unseen" else "" for key in targets)
+    names = [in_figure(k["target"]) + star for k, star in zip(targets, unseen, strict=True)]
+    _draw_causes(by_target, summary, targets, names)
+    causes.set_xlabel("episodes that failed, per cent")
+    by_target.set_xlabel("the same by target; * never a target in training")
+    width = 0.8 / max(len(groups), 1)
+    for i, group in enumerate(summary.groups):
+        middles = np.arange(len(METRES)) + (i - (len(groups) - 1) / 2) * width
+        metres.bar(middles, summary.missing(group), width, color=("0.7", "0.3")[i], label=group)
+    names = [textwrap.fill(name, 14) for name in METRES_NAMES]
+    metres.set_xticks(range(len(METRES)), names, fontsize=8)
+    metres.set(xlabel="Done out of reach: how much nearer it had to be", ylabel="episodes")
+    metres.legend(frameon=False)
+    for axis in (causes, metres, by_target):
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.suptitle(_in_lines(f"Failures of {summary.agent}, split {summary.split}"))
+    handles, labels = causes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
+    drawing.save(figure, path, DPI)
+
+
+def _draw_causes(
+    axis: Axes, summary: Summary, keys: Sequence[dict[str, str]], names: Sequence[str]
+) -> None:
+    """A bar for the episodes with each of these fields: the share that failed, by cause."""
+    left = np.zeros(len(keys))
+    for i, (key, cause) in enumerate(CAUSES.items()):
+        counts = [summary.count(**chosen, cause=key) for chosen in keys]
+        played = [summary.episodes(**chosen) for chosen in keys]
+        share = 100 * np.divide(counts, played)
+        axis.barh(range(len(keys)), share, left=left, color=_CAUSE_COLORS[i], label=cause.name)
+        left += share
+    axis.set_yticks(range(len(keys)), names)
+    axis.invert_yaxis()
 
 
 def _in_lines(title: str) -> str:

@@ -129,7 +129,8 @@ def play(
     first: list[Trace] = []
     if choice.episode is not None:
         record = episode_lookup.read_record(folder_of(runs[0]), choice.episode, tables)
-        episode, first = record.episode, [trace.retrace(players[0], tables, *record)]
+        episode = record.episode
+        first = [trace.retrace(players[0], tables, episode, record.actions)]
     else:
         assert choice.scene is not None
         assert choice.target is not None

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from tdanet_jax.analysis.episode_lookup import Start, find, name_ranges, read_record
+from tdanet_jax.analysis.episode_lookup import Start, find, name_ranges, read_record, read_records
 from tdanet_jax.vocabulary import ACTION_NAMES
 from tests.support.handmade import houses
 from tests.support.oracle import World
@@ -106,6 +106,7 @@ def test_damaged_records_are_refused_by_line(some_rooms, opinionated_run, tmp_pa
         "x is not a number": {key: value for key, value in good.items() if key != "x"},
         "z is not a number": good | {"z": "north"},
         "not the record of an episode": [1, 2],
+        "group is not one of seen, unseen": good | {"group": "both"},
     }
     far = good | {"x": good["x"] + 0.02}
     lines = [json.dumps(row) for row in [*bad.values(), far]] + ["{"]
@@ -119,5 +120,22 @@ def test_damaged_records_are_refused_by_line(some_rooms, opinionated_run, tmp_pa
         read_record(tmp_path, len(lines), some_rooms)
     with pytest.raises(ValueError, match="no such file; a run writes it when training ends"):
         read_record(tmp_path / "nowhere", 0, some_rooms)
-    actions = read_record(opinionated_run, 0, some_rooms).actions
-    assert [ACTION_NAMES[action] for action in actions] == good["actions"]
+    record = read_record(opinionated_run, 0, some_rooms)
+    assert [ACTION_NAMES[action] for action in record.actions] == good["actions"]
+    assert record.group == good["group"]
+
+
+def test_all_records_are_those_of_each_line(some_rooms, opinionated_run, tmp_path):
+    records = read_records(opinionated_run, some_rooms)
+    assert len(records) == 8
+    for i, record in enumerate(records):
+        alone = read_record(opinionated_run, i, some_rooms)
+        assert (record.episode, record.group) == (alone.episode, alone.group)
+        np.testing.assert_array_equal(record.actions, alone.actions)
+    text = (opinionated_run / "episodes.jsonl").read_text()
+    (tmp_path / "episodes.jsonl").write_text(text + "{}\n")
+    with pytest.raises(ValueError, match=r"line 9: x is not a number"):
+        read_records(tmp_path, some_rooms)
+    (tmp_path / "episodes.jsonl").write_text("")
+    with pytest.raises(ValueError, match=r"episodes.jsonl: no episodes"):
+        read_records(tmp_path, some_rooms)

@@ -180,6 +180,14 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint bare --episode 3 --out full/file/a.png", "full/file/a.png: Not a directory"),
         ("--checkpoint bare --episode 3 --out full/file/a.gif", "full/file/a.gif: Not a directory"),
     ],
+    "failures": [
+        ("", "Missing from tdanet failures: --checkpoint RUN"),
+        ("--checkpoint nowhere", "nowhere/config.json: no such file"),
+        ("--checkpoint bare", "bare/checkpoints: no checkpoint"),
+        ("--checkpoint bare --replays=-1", "--replays -1: must not be negative"),
+        ("--checkpoint bare --out full/file/a", "full/file/a: Not a directory"),
+        ("--checkpoint bare --data nowhere.npz", "nowhere.npz: no such file"),
+    ],
     "attention": [
         ("", "Missing from tdanet attention: --checkpoint"),
         ("--checkpoint bare --scene FloorPlan1", "give --scene and --target, or --episode"),

@@ -114,7 +114,8 @@ def agents(recorder: Recorder, last: str) -> None:
     recorder.record("tdanet_jax.scenes.target_distances.with_targets", gives=tables)
     recorder.record("tdanet_jax.analysis.trace.load_player", gives=player)
     recorder.record(f"{EPISODE}.find", gives="an episode")
-    recorder.record(f"{EPISODE}.read_record", gives=lambda: Record("a record"))
+    record = SimpleNamespace(episode="a recorded episode", actions="its actions")
+    recorder.record(f"{EPISODE}.read_record", gives=record)
     recorder.record("tdanet_jax.analysis.trace.play", gives=TRACE)
     recorder.record("tdanet_jax.analysis.trace.retrace", gives=TRACE)
     recorder.record("tdanet_jax.analysis.trace.Player", gives="the shortest path")
@@ -123,15 +124,6 @@ def agents(recorder: Recorder, last: str) -> None:
     recorder.record("tdanet_jax.commands.attention.write_pairs", gives=None)
     recorder.record("tdanet_jax.commands.attention.example", gives=TRACE)
     recorder.record(last, gives=Ended)
-
-
-class Record(tuple):
-    """A recorded episode, as `read_record` gives it."""
-
-    episode = "a recorded episode"
-
-    def __new__(cls, name: str) -> Record:
-        return super().__new__(cls, (name, "its actions"))
 
 
 BENCHMARKS = tuple(
@@ -233,6 +225,19 @@ def prepare_serve(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.commands.serve.read_lines", gives=Ended)
 
 
+def prepare_failures(recorder: Recorder) -> None:
+    split = SimpleNamespace(name="18/4")
+    task = SimpleNamespace(tables=Tables("FloorPlan1"), split=split, eval_params="params")
+    player = SimpleNamespace(name="one", task=task)
+    recorder.record("tdanet_jax.scenes.dataset.load_rooms", gives=Rooms(task.tables, None))
+    recorder.record("tdanet_jax.scenes.target_distances.with_targets", gives=task.tables)
+    recorder.record("tdanet_jax.analysis.trace.load_player", gives=player)
+    recorder.record(f"{EPISODE}.read_records", gives=list)
+    recorder.record("tdanet_jax.analysis.failures.summarise", gives="a summary")
+    recorder.record("tdanet_jax.analysis.failures.examples", gives=list)
+    recorder.record("tdanet_jax.analysis.figures.failures", gives=Ended)
+
+
 def prepare_noise(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.agent.measured_noise.read_coco", gives=((), ()))
     recorder.record("tdanet_jax.agent.measured_noise.measure", gives=Ended)
@@ -250,6 +255,7 @@ PREPARE: dict[str, Callable[[Recorder], None]] = {
     "replay": lambda r: agents(r, "tdanet_jax.io.files.write_text"),
     "trajectories": lambda r: agents(r, "tdanet_jax.analysis.pictures.trajectories"),
     "attention": lambda r: agents(r, "tdanet_jax.analysis.pictures.attention_episode"),
+    "failures": prepare_failures,
     "sweep": prepare_sweep,
     "benchmark": prepare_benchmark,
     "scaling": prepare_scaling,
@@ -379,6 +385,16 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
         {
             flag: ONE_EPISODE[flag]
             for flag in ("--seed", "--data", "--word-vectors", "--policy", "--out")
+        },
+    ),
+    "failures": (
+        "--checkpoint run",
+        {
+            "--checkpoint": ("--checkpoint run", "--checkpoint other"),
+            "--replays": "--replays 3",
+            "--data": "--data rooms.npz",
+            "--word-vectors": "--word-vectors words.txt",
+            "--out": "--out new",
         },
     ),
     "sweep": (

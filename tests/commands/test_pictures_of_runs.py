@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tdanet_jax.commands import attention, evaluate, replay, trajectories
+from tdanet_jax.commands import attention, evaluate, failures, replay, trajectories
 from tdanet_jax.commands.one_episode import Choice
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.scenes import dataset
@@ -241,3 +241,38 @@ def test_the_page_of_a_real_room_as_a_user_asks_for_it(opinionated_run, tmp_path
         page.keyboard.press("End")
         assert page.locator("#count").inner_text() == "end"
         assert complaints == []
+
+
+def test_failures_are_sorted_and_some_can_be_looked_at(
+    tmp_path, capsys, rooms_file, opinionated_run
+):
+    rows = [json.loads(row) for row in (opinionated_run / "episodes.jsonl").open()]
+    failed = [i for i, row in enumerate(rows) if not row["success"]]
+    assert 0 < len(failed) < 8
+    out = tmp_path / "why"
+    words = ["--checkpoint", str(opinionated_run), "--data", str(rooms_file), "--out", str(out)]
+    failures.main([*words, "--replays", "2"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"my-run, split 18/4 episodes 8 seen failed {len(failed)} seen Done with" in said
+    assert said.endswith(f"wrote {out}/failures.md, .json and .png and 2 replays")
+    written = json.loads((out / "failures.json").read_text())
+    assert [failure["episode"] for failure in written["failures"]] == failed
+    pages = sorted(out.glob("*.html"))
+    assert len(pages) == 2
+    for page in pages:
+        index = int(page.stem.removeprefix("episode-"))
+        assert index in failed
+        assert f"]({page.name}): " in (out / "failures.md").read_text()
+        text = re.search(r'type="application/json">(.*?)</script>', page.read_text(), re.S)
+        shown = json.loads(text.group(1))
+        assert shown["target"] == rows[index]["target"]
+        assert not shown["players"][0]["success"]
+    with Image.open(out / "failures.png") as picture:
+        assert picture.width > 500
+
+
+def test_failures_of_a_point_of_the_history_are_refused(tmp_path, capsys, opinionated_run):
+    point = opinionated_run / "history" / "000001.npz"
+    with pytest.raises(SystemExit):
+        failures.main(["--checkpoint", str(point), "--out", str(tmp_path / "out")])
+    assert "give the run" in capsys.readouterr().err

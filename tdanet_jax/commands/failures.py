@@ -1,0 +1,109 @@
+"""Sorts a run's failed test episodes by cause, and writes some of them as pages.
+
+    tdanet failures --checkpoint runs/...
+
+Reads the run's episodes.jsonl; nothing is played again. Writes failures.md, failures.json,
+failures.png and the replays of some failures into --out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tdanet_jax.commands import one_episode
+from tdanet_jax.commands.console import (
+    RunPath,
+    check_folder,
+    console,
+    fail,
+    folder_for,
+    one_line_errors,
+    parse,
+)
+from tdanet_jax.commands.one_episode import Choice
+from tdanet_jax.io.bundled_agents import folder_of
+
+if TYPE_CHECKING:
+    from tdanet_jax.analysis.failures import Summary
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Sorts a run's failed test episodes by cause, and writes some of them as pages."""
+
+    checkpoint: RunPath
+    """Folder of a run, or a bundled agent's name."""
+    replays: int = 5
+    """Failures to write as pages: of each cause in turn, the commonest first."""
+    out: Path | None = None
+    """Folder to write; by default <run>/failures."""
+    data: str | None = None
+    """File of rooms that `tdanet scenes import` wrote; by default, the run's rooms."""
+    word_vectors: str | None = None
+    """File of word vectors, instead of the copy that the run holds of its own."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs the command."""
+    with one_line_errors():
+        command = parse(Command, arguments, prog="tdanet failures", description=__doc__)
+        if command.replays < 0:
+            fail(f"--replays {command.replays}: must not be negative")
+        if folder_of(command.checkpoint) != command.checkpoint:
+            fail(f"--checkpoint {command.checkpoint}: give the run; its episodes are its last ones")
+        out = command.out or folder_for(command.checkpoint) / "failures"
+        check_folder(out)
+        _write(command, out)
+
+
+def _write(command: Command, out: Path) -> None:
+    """Sorts, and writes the files."""
+    from tdanet_jax.analysis import episode_lookup, failures, figures, replay, trace
+    from tdanet_jax.io import files
+    from tdanet_jax.training import devices
+
+    devices.keep_compiled()
+    devices.start()
+    run = command.checkpoint
+    choice = Choice(data=command.data, word_vectors=command.word_vectors)
+    player = one_episode.load_players(choice, [run], one_episode.rooms_of(choice, [run]))[0]
+    tables = player.task.tables
+    records = episode_lookup.read_records(run, tables)
+    summary = failures.summarise(
+        player.name, player.task.split.name, records, tables, player.task.eval_params
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    pages = {f"episode-{f.episode}.html": f for f in failures.examples(summary, command.replays)}
+    for page, failure in pages.items():
+        record = records[failure.episode]
+        shown = trace.retrace(player, tables, record.episode, record.actions)
+        files.write_text(out / page, replay.page([shown], tables))
+    figures.failures(summary, out / "failures.png")
+    files.write_text(out / "failures.json", json.dumps(failures.to_json(summary), indent=1) + "\n")
+    files.write_text(out / "failures.md", failures.markdown(summary, "failures.png", pages))
+    _print(summary)
+    written = "failures.md, .json and .png"
+    console.print(f"wrote {out / written}" + (f" and {len(pages)} replays" if pages else ""))
+
+
+def _print(summary: Summary) -> None:
+    """Prints how many failed, and why."""
+    from tdanet_jax.analysis.failures import CAUSES
+
+    groups = summary.groups
+    console.print(f"{summary.agent}, split {summary.split}")
+    for heading, chosen in (
+        ("episodes", None),
+        ("failed", {}),
+        *((cause.meaning, {"cause": key}) for key, cause in CAUSES.items()),
+    ):
+        counts = (
+            summary.episodes(group=g) if chosen is None else summary.count(group=g, **chosen)
+            for g in groups
+        )
+        indent = "    " if chosen else "  "
+        cells = (f"{count:>5,} {group}" for count, group in zip(counts, groups, strict=True))
+        console.print(f"{indent + heading:<62}" + "  ".join(cells))
