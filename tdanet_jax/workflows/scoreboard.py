@@ -140,11 +140,12 @@ def add(
         raise ValueError(f"--name {name}: use letters, digits, dots and hyphens")
     if out.exists():
         raise ValueError(f"--name {name}: {out} exists")
-    row = read(run)
+    row = dataclasses.replace(read(run), name=name)
     _check(run, row)
     records = regular.read_bytes(run / report.EPISODES_FILE, links=False)
     processes = _processes(run, row, command, machine)
-    row = dataclasses.replace(row, name=name)
+    if row.config is not None:
+        row = dataclasses.replace(row, config=_without_folders(row.config))
     for other in rows(folder):
         if _identity(other) == _identity(row):
             raise ValueError(f"{run}: {out.parent / other.name} has this agent with this seed")
@@ -152,7 +153,7 @@ def add(
     with files.replacing(out) as fresh:
         fresh.mkdir()
         if row.config is not None:
-            configs.save(_without_folders(row.config), fresh / CONFIG_FILE)
+            configs.save(row.config, fresh / CONFIG_FILE)
         if row.metrics:
             metrics = regular.read_bytes(run / METRICS_FILE, links=False)
             (fresh / METRICS_FILE).write_bytes(metrics)
@@ -172,7 +173,9 @@ def _check(run: Path, row: Row) -> None:
     if split not in NAMED:
         raise FileError(path, f"split {split}: the scoreboard has {', '.join(NAMED)}")
     version = episodes.stored_version(is_open(split))
-    if results.get("data") is not None or results["data_version"] != version:
+    if results.get("data") is not None:
+        raise FileError(path, f"in the rooms of {results['data']}: not in the bundled ones")
+    if results["data_version"] != version:
         raise FileError(path, f"of scene tables {results['data_version']}, today's are {version}")
     if results.get("targets", PAPER) != (OPEN if is_open(split) else PAPER):
         raise FileError(path, f"targets {results['targets']}: not those of the split")
