@@ -140,6 +140,8 @@ def add(
         raise ValueError(f"--name {name}: use letters, digits, dots and hyphens")
     if out.exists():
         raise ValueError(f"--name {name}: {out} exists")
+    if not (run / report.RESULTS_FILE).exists():
+        raise FileError(run / report.RESULTS_FILE, "no such file; is the run finished?")
     row = dataclasses.replace(read(run), name=name)
     _check(run, row)
     records = regular.read_bytes(run / report.EPISODES_FILE, links=False)

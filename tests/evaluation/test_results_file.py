@@ -28,7 +28,8 @@ def test_results_of_a_validation_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("place", "value"),
     [
-        ("split", "../../escaped"), ("split", "../../Mug"), ("split", "14/8,"), ("split", "-validation"),
+        ("split", "../../escaped"), ("split", "../../Mug"), ("split", "14/8,"),
+        ("split", "-validation"),
         ("split", None), ("model", 3),
         ("policy", "a\x1b[2J"), ("data_version", None), ("seed", -1), ("seed", 0.5),
         ("seed", 10**400), ("steps", "many"), ("episodes_trained", True), ("data", 3),
