@@ -15,6 +15,7 @@ import tdanet_jax
 from tdanet_jax import Callbacks, TrainConfig, _moved
 from tdanet_jax.config import LearnerConfig, NetworkConfig
 from tdanet_jax.evaluation import policies
+from tdanet_jax.training import run_file
 from tdanet_jax.training.journal import read_metrics
 
 TINY = TrainConfig(
@@ -94,6 +95,7 @@ def test_a_run_from_python_is_stopped(tmp_path: Path) -> None:
     assert tdanet_jax.train(config, folder, callbacks=stopper) is None
     assert stopper.notes[0] == f"tdanet, split 14/8, seed 0 -> {folder}"
     assert [row["steps"] for row in read_metrics(folder)] == [400, 800]
+    assert [process.command for process in run_file.read(folder)] == [None]
     with pytest.raises(ValueError, match="exists and is not empty"):
         tdanet_jax.train(config, folder)
     with pytest.raises(ValueError, match="needs a configuration"):

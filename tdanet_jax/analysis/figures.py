@@ -62,6 +62,36 @@ def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> No
     drawing.save(figure, path, DPI)
 
 
+def training_curves(
+    runs: Sequence[tuple[str, Sequence[dict[str, Any]]]], title: str, path: Path
+) -> None:
+    """SR and SPL in the training rooms against environment steps, a line for each run.
+
+    Args:
+      runs: a label and the rows of `metrics.jsonl` of each; runs of one label share a colour.
+      title: above both panels.
+      path: the picture's file.
+    """
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    axes = figure.subplots(1, 2)
+    labels = [*dict.fromkeys(label for label, _ in runs)]
+    for axis, measure, name in zip(axes, MEASURES, ("success", "spl"), strict=True):
+        for label, rows in runs:
+            rates = 100 * np.array([row[name] for row in rows], float)  # None becomes NaN: a gap
+            color = PALETTE[labels.index(label) % len(PALETTE)]
+            axis.plot([row["steps"] / 1e6 for row in rows], rates, color=color, linewidth=1)
+        axis.set(xlabel="million environment steps", ylim=(0, 100), xlim=(0, None))
+        axis.set(ylabel=f"{measure}, per cent, training rooms")
+        axis.grid(alpha=0.3)
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.suptitle(_in_lines(title))
+    lines = {label: line for (label, _), line in zip(runs, axes[0].lines, strict=True)}
+    figure.legend(
+        lines.values(), map(in_figure, lines), loc="outside lower center", ncols=2, frameon=False
+    )
+    drawing.save(figure, path, DPI)
+
+
 def scaling(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Steps per second and memory of training against each `size` and its `value`."""
     sizes = list(dict.fromkeys(row["size"] for row in rows))

@@ -160,8 +160,9 @@ def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
 
     from tdanet_jax.task import load_task
     from tdanet_jax.tools import benchmarking
+    from tdanet_jax.training import devices
 
-    machine = {"processor": benchmarking.processor(), "jax": jax.__version__}
+    machine = {"processor": devices.processor(), "jax": jax.__version__}
     yield {"part": "start", "device": str(jax.devices()[0]), **machine}
     if "tables" in command.parts:
         yield tables_row()

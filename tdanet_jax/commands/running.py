@@ -71,13 +71,18 @@ def parse_command(arguments: Sequence[str], where: str = "") -> Command:
 
 
 @contextlib.contextmanager
-def stoppable(advice: Callable[[], str]) -> Iterator[Reports]:
-    """Inside, SIGTERM or Ctrl-C ends the program: one line of advice, status 128 + signal."""
+def stoppable(advice: Callable[[], str], typed: str | None = None) -> Iterator[Reports]:
+    """Inside, SIGTERM or Ctrl-C ends the program: one line of advice, status 128 + signal.
+
+    Args:
+      advice: makes the line.
+      typed: the command line of what trains inside.
+    """
     stop = StopRequest()
     with stop.receiving():
         try:
             with contextlib.ExitStack() as shown:
-                yield Reports(stop, shown)
+                yield Reports(stop, shown, typed)
         except Stopped as stopped:
             console.print(f"stopped; {advice()}")
             stopped.answer()
@@ -86,8 +91,11 @@ def stoppable(advice: Callable[[], str]) -> Iterator[Reports]:
 class Reports(Callbacks):
     """Prints notes and results, shows progress, and stops the runs on a signal."""
 
-    def __init__(self, stop: StopRequest, shown: contextlib.ExitStack) -> None:
+    def __init__(
+        self, stop: StopRequest, shown: contextlib.ExitStack, typed: str | None = None
+    ) -> None:
         """`shown` holds the progress bar on the screen, if there is one."""
+        self.command = typed
         self._stop = stop
         self._shown = shown
         self._title = ""

@@ -129,7 +129,7 @@ def main(arguments: list[str] | None = None) -> None:
         check_alike([*sweep.find(command.out), *included], planned)
         check_folder(command.out)
         with output_may_break():
-            run(command, training, configs, included)
+            run(command, training, configs, included, shlex.join(["tdanet", "sweep", *words]))
 
 
 def share(command: Command, configs: Sequence[TrainConfig]) -> list[TrainConfig]:
@@ -196,10 +196,11 @@ def run(
     training: TrainingCommand,
     configs: Sequence[TrainConfig],
     included: Sequence[FinishedRun],
+    typed: str,
 ) -> None:
     """Trains and reports; says how to continue if a signal stops it."""
     try:
-        left = [] if command.report_only else train_all(command, training, configs)
+        left = [] if command.report_only else train_all(command, training, configs, typed)
         if command.shard is None:
             with stoppable(lambda: "finished evaluations are kept"):
                 unfinished = write_report(command.out, included, left)
@@ -220,7 +221,7 @@ def run(
 
 
 def train_all(
-    command: Command, training: TrainingCommand, configs: Sequence[TrainConfig]
+    command: Command, training: TrainingCommand, configs: Sequence[TrainConfig], typed: str
 ) -> list[Path]:
     """Trains the runs that are not finished.
 
@@ -228,6 +229,7 @@ def train_all(
       command: the sweep.
       training: the flags of the training command.
       configs: all runs.
+      typed: the command line, for their `run.json`.
 
     Returns:
       The folders of runs that are left to other processes, which train them.
@@ -259,7 +261,7 @@ def train_all(
             if folder not in left and sweep.progress(folder, config) != "finished"
         ]:
             try:
-                train_members(members, command.vmap_seeds, training.devices)
+                train_members(members, command.vmap_seeds, training.devices, typed)
                 break
             except BlockingIOError as held:
                 if held.filename not in [str(folder) for _, folder in members]:
@@ -270,7 +272,7 @@ def train_all(
 
 
 def train_members(
-    members: Sequence[tuple[TrainConfig, Path]], together: bool, device_count: int
+    members: Sequence[tuple[TrainConfig, Path]], together: bool, device_count: int, typed: str
 ) -> None:
     """Trains one run, or the seeds of one split and model together.
 
@@ -280,12 +282,12 @@ def train_members(
     from tdanet_jax.workflows.train import train, train_together
 
     if together:
-        with stoppable(lambda: "every seed is saved") as reports:
+        with stoppable(lambda: "every seed is saved", typed) as reports:
             train_together(members, reports)
         return
     ((config, folder),) = members
     resume = (folder / CONFIG_FILE).exists()
-    with stoppable(functools.partial(how_to_continue, folder, config)) as reports:
+    with stoppable(functools.partial(how_to_continue, folder, config), typed) as reports:
         train(config, folder, resume=resume, device_count=device_count, callbacks=reports)
 
 
@@ -316,7 +318,7 @@ def write_report(
     """
     from tdanet_jax.analysis import figures
     from tdanet_jax.evaluation import report
-    from tdanet_jax.tools import benchmarking
+    from tdanet_jax.training import devices
 
     if not (sweep.find(out) or included):
         if left:
@@ -341,7 +343,7 @@ def write_report(
             untrained=sweep.untrained(runs, UNTRAINED_SEED),
             costs=costs(runs),
             curves=curves,
-            machine=benchmarking.processor(),
+            machine=devices.processor(),
             code=report.code_version(),
             unfinished=[folder.name for folder in unfinished],
         )

@@ -2,7 +2,7 @@
 
     tdanet train --split 18/4
 
-Writes config.json, classes.json, metrics.jsonl, checkpoints, results.json, results.md,
+Writes run.json, config.json, classes.json, metrics.jsonl, checkpoints, results.json, results.md,
 episodes.jsonl and learning_curve.png into --out (by default
 runs/<split>-<model>-seed<seed>-<time>).
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -34,7 +35,7 @@ def main(arguments: list[str] | None = None) -> None:
         if command.resume is None and not cluster.several():
             files.check_empty(folder, f" (to continue there: --resume {folder})")
         with output_may_break():
-            run(command, config, folder)
+            run(command, config, folder, shlex.join(["tdanet", "train", *words]))
 
 
 def check(command: Command) -> TrainConfig:
@@ -71,9 +72,16 @@ def default_folder(config: TrainConfig) -> Path:
     return Path("runs") / f"{run_name(config)}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
-def run(command: Command, config: TrainConfig, folder: Path) -> None:
-    """Trains to the end of the budget, then evaluates and reports."""
-    with stoppable(lambda: how_to_continue(folder, config)) as reports:
+def run(command: Command, config: TrainConfig, folder: Path, typed: str) -> None:
+    """Trains to the end of the budget, then evaluates and reports.
+
+    Args:
+      command: what was asked for.
+      config: the run.
+      folder: where everything is written.
+      typed: the command line, for `run.json`.
+    """
+    with stoppable(lambda: how_to_continue(folder, config), typed) as reports:
         from tdanet_jax.workflows.train import train
 
         results = train(

@@ -92,7 +92,7 @@ def labels(results: Sequence[Result], names: Sequence[str]) -> list[str]:
     for kind, name in zip(kinds, names, strict=True):
         rivals = [dict(other.values) for other in kinds if other.model == kind.model]
         differing = [
-            _shown(flag, value)
+            setting(flag, value)
             for flag, value in kind.values
             if (flag in BEYOND and value) or any(rival.get(flag) != value for rival in rivals)
         ]
@@ -100,7 +100,8 @@ def labels(results: Sequence[Result], names: Sequence[str]) -> list[str]:
     return out
 
 
-def _shown(flag: str, value: Any) -> str:
+def setting(flag: str, value: Any) -> str:
+    """A flag and its value in words: --odometry, no --scores, --gamma 0.97."""
     if value is None or value is False:
         return f"no {flag}"
     return flag if value is True else f"{flag} {value}"
@@ -184,23 +185,29 @@ def _same_episodes(
 
 
 def table(
-    first: Sequence[str], rows: Iterable[tuple[Sequence[str], Mapping[str, Any]]]
+    first: Sequence[str],
+    rows: Iterable[tuple[Sequence[str], Mapping[str, Any]]],
+    *,
+    groups: Sequence[str] = GROUPS,
+    buckets: Sequence[str] = tuple(BUCKETS),
+    measures: Sequence[str] = metrics.MEASURES,
 ) -> list[str]:
     """A table as in the paper: the measures of seen and unseen targets, L >= 1 and L >= 5.
 
     Args:
       first: headings of the columns before the results.
       rows: the cells of these columns, and group -> bucket -> measure -> a printable value.
+      groups: those to show.
+      buckets: those to show.
+      measures: those to show.
     """
-    names = [f"{g} {m} {b}" for g in GROUPS for b in BUCKETS for m in metrics.MEASURES]
-    heads = [*first, *names]
+    columns = [(group, bucket, m) for group in groups for bucket in buckets for m in measures]
+    heads = [*first, *(f"{group} {measure} {bucket}" for group, bucket, measure in columns)]
     lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
-    for cells, groups in rows:
+    for cells, found in rows:
         figures = [
-            _cell(((groups.get(group) or {}).get(bucket) or {}).get(measure))
-            for group in GROUPS
-            for bucket in BUCKETS
-            for measure in metrics.MEASURES
+            _cell(((found.get(group) or {}).get(bucket) or {}).get(measure))
+            for group, bucket, measure in columns
         ]
         lines.append(f"| {' | '.join([*cells, *figures])} |")
     return lines

@@ -185,10 +185,20 @@ def published(
     return lists
 
 
+def stored_version(of_open: bool) -> str:
+    """The version of the scene tables that the stored lists belong to.
+
+    Args:
+      of_open: those of the open-vocabulary benchmark, whose tables have other targets.
+    """
+    with np.load(assets.path(ASSET), allow_pickle=False) as data:
+        return bytes(data[f"{OPEN}/data_version" if of_open else "data_version"]).decode()
+
+
 def _committed(tables: SceneTables, split: Split) -> dict[str, Episodes]:
     """The stored lists of a split that has a name, with its own targets; none of another."""
+    version = stored_version(split.is_open)
     with np.load(assets.path(ASSET), allow_pickle=False) as data:
-        version = bytes(data[f"{OPEN}/data_version" if split.is_open else "data_version"]).decode()
         if (split.is_open or tables.targets == ALL_TARGETS) and version != tables.data_version:
             raise ValueError(
                 f"{ASSET} belongs to scene tables {version}, these are {tables.data_version}: "

@@ -37,11 +37,12 @@ def check(path: Path, results: Any) -> None:
     for name, most in _COUNTS.items():
         if number(path, results.get(name), name, most) < 0 or type(results[name]) is not int:
             raise FileError(path, f"{name} is not a count")
+    name = results["split"].removesuffix("-validation")
     try:
-        canonical = split_name(results["split"], None)
+        canonical = split_name(name, None)
     except ValueError as error:
         raise FileError(path, error) from None
-    if canonical != results["split"]:  # it becomes part of the names of pictures
+    if canonical != name:  # it becomes part of the names of pictures
         raise FileError(path, f"split {results['split']}: not the name of a split")
     for name in ("data", "targets"):
         if not isinstance(results.get(name), str | None):

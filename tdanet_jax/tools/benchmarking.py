@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -60,16 +59,6 @@ def timed(call: Callable[[], Any], repeats: int, inner: int = 1) -> tuple[float,
         jax.block_until_ready(out)
         taken.append((time.perf_counter() - began) / inner)
     return first, statistics.median(taken)
-
-
-def processor() -> str:
-    """The processor's name, if the system tells it."""
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def machine_row(repeats: int) -> Row:

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 class Callbacks:
     """What a caller hears while runs train. Override the methods that you need."""
 
+    command: str | None = None
+    """The command line that trains the runs, for their `run.json`."""
+
     def on_rooms(self, done: float, total: int) -> None:
         """So many of the bundled rooms have been rebuilt; only on a machine's first start."""
 

@@ -14,6 +14,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import platform
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -139,6 +141,37 @@ def _join(variable: str, **arguments: Any) -> None:
 def first() -> Mesh:
     """The first device alone."""
     return Mesh(np.array(jax.local_devices()[:1]), (AXIS,))
+
+
+def machine(mesh: Mesh) -> str:
+    """What a mesh is made of: AMD EPYC 7B13, 2 cores; NVIDIA H200, 8 devices, 2 processes.
+
+    Of a CPU, the cores that this process may use.
+    """
+    device = mesh.devices.flat[0]
+    if device.platform == "cpu":
+        affinity = getattr(os, "sched_getaffinity", None)  # Linux alone tells
+        parts = [processor(), _counted(len(affinity(0)) if affinity else os.cpu_count(), "core")]
+    else:
+        parts = [device.device_kind, _counted(mesh.size, "device")]
+    if jax.process_count() > 1:
+        parts.append(_counted(jax.process_count(), "process"))
+    return ", ".join(parts)
+
+
+def _counted(number: int | None, noun: str) -> str:
+    plural = "es" if noun.endswith("s") else "s"
+    return f"{number} {noun}{plural * (number != 1)}"
+
+
+def processor() -> str:
+    """The processor's name, if the system tells it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def is_lead() -> bool:

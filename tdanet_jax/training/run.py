@@ -23,7 +23,9 @@ from tdanet_jax.training.learner import TrainState
 
 
 class Run:
-    """A run in its folder: `state` is its present state, `seconds` its training time so far."""
+    """A run in its folder: `state` is its present state, `seconds` its training time so far, `mesh`
+    the devices that it trains on.
+    """
 
     def __init__(
         self, folder: Path | str, config: TrainConfig, task: Task, mesh: Mesh | None = None
@@ -42,13 +44,13 @@ class Run:
         self.task = task
         self.model = task.model
         self.seconds = 0.0
-        self._mesh = mesh or devices.first()
-        self._shared = devices.everywhere(self._mesh)
+        self.mesh = mesh or devices.first()
+        self._shared = devices.everywhere(self.mesh)
         self._words, self._params = jax.device_put(
             (task.train_words, task.train_params), self._shared
         )
         shapes = jax.eval_shape(self._init, jax.random.key(0), self._words, self._params)
-        self._layout = devices.layout(shapes, self._mesh)
+        self._layout = devices.layout(shapes, self.mesh)
         self.checkpoints = Checkpoints(folder)
         self._journal: Journal | None = None
         self._saved: int | None = None  # updates of the checkpoint with the present state
@@ -101,7 +103,7 @@ class Run:
                 "data_version": self.task.tables.data_version,
                 "variants": self.task.variants_version,
             }
-            state = devices.whole(self.state, self._mesh)
+            state = devices.whole(self.state, self.mesh)
             if devices.is_lead():
                 self.checkpoints.save(state, meta)
             self._saved = int(self.state.updates)

@@ -22,7 +22,7 @@ from tdanet_jax.io.untrusted import regular
 from tdanet_jax.models.factory import unused_flags
 from tdanet_jax.scenes.dataset import idle_rooms
 from tdanet_jax.task import load_task, resolve
-from tdanet_jax.training import checkpoint, devices
+from tdanet_jax.training import checkpoint, devices, run_file
 from tdanet_jax.training.callbacks import Callbacks
 from tdanet_jax.training.journal import SINKS, Row, read_metrics
 from tdanet_jax.training.run import Run, chunks_together
@@ -174,6 +174,8 @@ def _prepare(run: Run, callbacks: Callbacks) -> None:
     if run.config.word_vectors is not None and not (folder / WORD_VECTORS_FILE).exists():
         task.vectors.save_copy(folder / WORD_VECTORS_FILE, task.tables.classes)
     task.classes.save(folder)
+    process = run_file.this_process(callbacks.command, report.code_version(), run.mesh)
+    run_file.add(folder, process)
     configs.save(run.config, folder / CONFIG_FILE)
 
 

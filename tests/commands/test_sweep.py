@@ -29,7 +29,7 @@ TINY = [
 ]  # fmt: skip
 RUN_FILES = {
     "config.json", "classes.json", "metrics.jsonl", "checkpoints", "history", "results.json",
-    "results.md", "episodes.jsonl", "learning_curve.png", ".lock",
+    "results.md", "episodes.jsonl", "learning_curve.png", "run.json", ".lock",
 }  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import socket
 import sys
@@ -14,6 +15,7 @@ import pytest
 import tdanet_jax
 from tdanet_jax.commands import evaluate, train_zero_shot
 from tdanet_jax.io import files
+from tdanet_jax.training import run_file
 from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.workflows import train as training
 from tests.support import command
@@ -21,7 +23,7 @@ from tests.support import command
 WRITTEN = {
     "classes.json",
     "config.json", "metrics.jsonl", "checkpoints", "results.json", "results.md", "episodes.jsonl",
-    "learning_curve.png", "history",
+    "learning_curve.png", "history", "run.json",
 }  # fmt: skip
 
 
@@ -88,6 +90,11 @@ def test_it_trains_evaluates_and_goes_on_after_kill_and_term(ithor, tmp_path, ca
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert {p.name for p in out.iterdir()} == WRITTEN | {files.LOCK_FILE}
+    again = f"tdanet train --resume {out}"
+    typed = shlex.join(["tdanet", "train", *map(str, arguments)])
+    processes = run_file.read(out)
+    assert [process.command for process in processes] == [typed, again, again]
+    assert processes[0].commit == json.loads((out / "results.json").read_text())["commit"]
     rows = [json.loads(line) for line in metrics.read_text().splitlines()]
     assert [row["steps"] for row in rows] == list(range(400, 12_001, 400))
     assert len(list((out / "history").iterdir())) == 20

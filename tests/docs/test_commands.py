@@ -84,7 +84,8 @@ def test_a_command_is_accepted(
         _, module, *arguments = rest
         if module == "venv":
             return
-        assert module.startswith(("experiments.", "tests.")), f"no module of ours: {module}"
+        ours = ("experiments.", "tests.", "tdanet_jax.tools.")
+        assert module.startswith(ours), f"no module of ours: {module}"
         for place, name in PARSERS:
             monkeypatch.setattr(place, name, raising(getattr(place, name)))
         monkeypatch.setattr(sys, "argv", [module, *arguments])

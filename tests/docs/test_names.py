@@ -24,7 +24,8 @@ FOREIGN = {
 }  # fmt: skip
 #: Where the files are that a page may name.
 FOLDERS = (
-    "tests/", "tdanet_jax/", "experiments/", "docs/", "assets/", "agents/18", "notebooks/", ".ci/"
+    "tests/", "tdanet_jax/", "experiments/", "docs/", "assets/", "agents/18", "notebooks/",
+    "results/", ".ci/",
 )  # fmt: skip
 
 pages = pytest.mark.parametrize("page", PAGES)

@@ -19,10 +19,17 @@ def test_what_an_evaluation_wrote_is_read() -> None:
     assert results_file.read(BUNDLED) == json.loads(BUNDLED.read_text())
 
 
+def test_results_of_a_validation_are_read(tmp_path: Path) -> None:
+    content = json.loads(BUNDLED.read_text()) | {"split": "Mug,CD-validation"}
+    (tmp_path / "results.json").write_text(json.dumps(content))
+    assert results_file.read(tmp_path / "results.json") == content
+
+
 @pytest.mark.parametrize(
     ("place", "value"),
     [
         ("split", "../../escaped"), ("split", "../../Mug"), ("split", "14/8,"),
+        ("split", "-validation"),
         ("split", None), ("model", 3),
         ("policy", "a\x1b[2J"), ("data_version", None), ("seed", -1), ("seed", 0.5),
         ("seed", 10**400), ("steps", "many"), ("episodes_trained", True), ("data", 3),

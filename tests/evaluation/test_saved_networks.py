@@ -24,8 +24,9 @@ from tdanet_jax.evaluation import report, saved_networks
 from tdanet_jax.io import bundled_agents
 from tdanet_jax.scenes import SceneTables, dataset
 from tdanet_jax.splits import GROUPS
-from tdanet_jax.training import history
+from tdanet_jax.training import devices, history
 from tdanet_jax.training.checkpoint import newest
+from tdanet_jax.training.run_file import RUN_FILE
 from tdanet_jax.words import WordVectors
 from tdanet_jax.workflows import train as training
 from tests.conftest import TINY, save_untrained
@@ -107,7 +108,8 @@ def run_of_files(
     )
     vectors = words.load_word_vectors(config.word_vectors)
     task, _ = save_untrained(config, home / "run", some_rooms, vectors)
-    training._prepare(SimpleNamespace(folder=home / "run", config=config, task=task), Callbacks())
+    where = {"folder": home / "run", "mesh": devices.first()}
+    training._prepare(SimpleNamespace(**where, config=config, task=task), Callbacks())
     return home / "run"
 
 
@@ -133,6 +135,8 @@ def test_a_run_leaves_its_machine(
         said = capsys.readouterr().out
         assert "with a copy of its word vectors" in said
         assert f"without its rooms, {run_of_files.parent / 'rooms.npz'}: " in said
+        assert (run_of_files / RUN_FILE).exists()
+        assert not (away / RUN_FILE).exists()  # what was typed may name folders of its author
     else:
         shutil.copytree(run_of_files, away)
     rooms = shutil.copy(run_of_files.parent / "rooms.npz", away.parent / "elsewhere.npz")

@@ -30,7 +30,7 @@ from tdanet_jax.io.untrusted import hdf5, pickles
 from tdanet_jax.models.classes import load_vocabulary
 from tdanet_jax.scenes import dataset, metadata
 from tdanet_jax.scenes.offline import extras, importer, layout, reader
-from tdanet_jax.training import history, journal
+from tdanet_jax.training import history, journal, run_file
 from tdanet_jax.training.checkpoint import ARRAYS, FORMAT, META, Checkpoints
 from tests.support import handmade, original
 
@@ -162,6 +162,10 @@ def read_results(path: Path) -> None:
     comparison.summary([results_file.read(path)])
 
 
+def read_processes(path: Path) -> None:
+    run_file.read(path.parent)
+
+
 def read_record(path: Path) -> None:
     episode_lookup.read_record(path.parent, 0, ROOMS)
 
@@ -205,6 +209,7 @@ def run_files(run: Path) -> list[tuple[Path, Callable[[Path], object]]]:
               "L": 1, "actions": ["Done"]}  # fmt: skip
     (run / "episodes.jsonl").write_text(json.dumps(record) + "\n")
     shutil.copyfile(BUNDLED / "results.json", run / "results.json")
+    run_file.write(run, [run_file.Process(command="tdanet train", machine="EPYC")])
     where = {"updates": 7, "episodes": 5, "seconds": 0.5, "point": 1, "data_version": "x"}
     network = {"a": {"b": np.ones(3, np.float32)}, "c": np.eye(4, dtype=np.float32)}
     point = history.write(run, history.Snapshot(network, **where))
@@ -219,6 +224,7 @@ def run_files(run: Path) -> list[tuple[Path, Callable[[Path], object]]]:
         (run / "classes.json", read_classes),
         (run / "metrics.jsonl", read_metrics),
         (run / "results.json", read_results),
+        (run / "run.json", read_processes),
         (run / "episodes.jsonl", read_record),
         (point, history.read),
         (saved / META, read_checkpoint),

@@ -13,7 +13,7 @@ from tdanet_jax.analysis import episode_lookup
 from tdanet_jax.evaluation import results_file, saved_networks
 from tdanet_jax.io.untrusted import FileError, regular
 from tdanet_jax.models.classes import load_vocabulary
-from tdanet_jax.training import history, journal
+from tdanet_jax.training import history, journal, run_file
 from tdanet_jax.training.checkpoint import Checkpoints
 from tests.support import handmade
 
@@ -43,6 +43,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "classes.json": load_vocabulary,
     "metrics.jsonl": journal.read_metrics,
     "episodes.jsonl": lambda run: episode_lookup.read_record(run, 0, handmade.lopsided()),
+    "run.json": run_file.read,
     "results.json": lambda run: results_file.read(run / "results.json"),
     "network.npz": lambda run: history.read(run / "network.npz"),
     "history/00000001.npz": lambda run: history.read(history.points(run)[0]),

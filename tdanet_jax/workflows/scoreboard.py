@@ -1,0 +1,237 @@
+"""The scoreboard: results that are kept in `results/`, and the tables of the pages made from them.
+
+A folder of `results/` is a row. It holds `results.json` and `episodes.jsonl`, what was reached;
+`run.json`, by which command and where; and, if something was trained, `config.json`, and
+`metrics.jsonl` if it is known how it learned.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from tdanet_jax import config as configs
+from tdanet_jax.config import CONFIG_FILE, PRESETS, TrainConfig, describe_departures
+from tdanet_jax.evaluation import comparison, episodes, report, results_file
+from tdanet_jax.evaluation.comparison import Result
+from tdanet_jax.io import files
+from tdanet_jax.io.untrusted import FileError, jsons, regular
+from tdanet_jax.splits import NAMED, OPEN, is_open
+from tdanet_jax.targets import PAPER
+from tdanet_jax.training import journal, run_file
+from tdanet_jax.training.journal import METRICS_FILE
+from tdanet_jax.training.run_file import Process
+from tdanet_jax.workflows.evaluate import UNTRAINED
+
+#: Flags that do not tell agents apart here. The last two are what "auto" became on a machine.
+_SHARED = (*comparison.NOT_SETTINGS, "--split", "--model", "--precision", "--image")
+#: `model` of a policy of one's own in its `results.json`.
+CUSTOM = "custom"
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A row of the scoreboard."""
+
+    name: str  # of its folder
+    results: Result  # the content of its `results.json`
+    config: TrainConfig | None  # None for a policy that was not trained here
+    metrics: Sequence[journal.Row]  # none if it is not known how it learned
+    processes: Sequence[Process]  # that trained or evaluated it, oldest first
+
+    @property
+    def agent(self) -> str:
+        """What seeds of one configuration share: its model and its flags, as they are typed."""
+        if self.config is None:
+            return self.name if self.results["model"] == CUSTOM else self.results["model"]
+        differing = {name: _differing(self.config, preset) for name, preset in PRESETS.items()}
+        preset = min(PRESETS, key=lambda name: len(differing[name]))
+        chosen = [] if preset == "default" else [f"--preset {preset}"]
+        return " ".join([self.config.model, *chosen, *differing[preset]])
+
+    @property
+    def senses(self) -> list[str]:
+        """What the agent senses beyond the paper's inputs."""
+        scores = self.config is not None and self.config.network.scores
+        return [*self.results.get("sensors", ()), *["scores"] * scores]
+
+    @property
+    def hours(self) -> float | None:
+        """Hours of training; None if unknown."""
+        seconds = self.metrics[-1].get("seconds") if self.metrics else None
+        return None if seconds is None else seconds / 3600
+
+
+def _differing(config: TrainConfig, preset: TrainConfig) -> list[str]:
+    """The flags in which a configuration differs from a preset, with its values."""
+    values, usual = comparison.flags(config), comparison.flags(preset)
+    return [
+        comparison.setting(flag, value)
+        for flag, value in values.items()
+        if flag not in _SHARED and value != usual[flag]
+    ]
+
+
+def rows(folder: Path | str) -> list[Row]:
+    """The rows in a folder, by name.
+
+    Raises:
+      FileError: a file of a row cannot be read.
+    """
+    return [read(path.parent) for path in sorted(Path(folder).glob(f"*/{report.RESULTS_FILE}"))]
+
+
+def read(folder: Path | str) -> Row:
+    """The row, or the finished run, in a folder.
+
+    Raises:
+      FileError: a file is missing or cannot be read.
+    """
+    folder = Path(folder)
+    return Row(
+        name=folder.name,
+        results=results_file.read(folder / report.RESULTS_FILE),
+        config=_read_config(folder / CONFIG_FILE) if (folder / CONFIG_FILE).exists() else None,
+        metrics=journal.read_metrics(folder) if (folder / METRICS_FILE).exists() else [],
+        processes=run_file.read(folder),
+    )
+
+
+def _read_config(path: Path) -> TrainConfig:
+    """A configuration; one that names custom code is read, too, as nothing runs it here."""
+    try:
+        return configs.from_json(jsons.load(path, links=False))
+    except FileError:
+        raise
+    except ValueError as error:
+        raise FileError(path, error) from None
+
+
+def add(
+    run: Path | str,
+    name: str,
+    folder: Path | str,
+    command: str | None = None,
+    machine: str | None = None,
+) -> Path:
+    """Copies what a row needs of a finished run, or of an evaluation that needs no run.
+
+    Folders in its command, which may name their owner, are left out.
+
+    Args:
+      run: its folder.
+      name: of the row.
+      folder: the folder of all rows.
+      command: by which it was made, if its `run.json` does not tell.
+      machine: on which, if its `run.json` does not tell.
+
+    Returns:
+      The folder of the row.
+
+    Raises:
+      ValueError: a file is missing or cannot be read, it is no result of the official test in
+        today's rooms, or the name or the seed are there already; one line that names it.
+    """
+    run, out = Path(run), Path(folder) / name
+    if not re.fullmatch(r"\w[\w.-]*", name):
+        raise ValueError(f"--name {name}: use letters, digits, dots and hyphens")
+    if out.exists():
+        raise ValueError(f"--name {name}: {out} exists")
+    if not (run / report.RESULTS_FILE).exists():
+        raise FileError(run / report.RESULTS_FILE, "no such file; is the run finished?")
+    row = dataclasses.replace(read(run), name=name)
+    _check(run, row)
+    records = regular.read_bytes(run / report.EPISODES_FILE, links=False)
+    processes = _processes(run, row, command, machine)
+    if row.config is not None:
+        row = dataclasses.replace(row, config=_without_folders(row.config))
+    for other in rows(folder):
+        if _identity(other) == _identity(row):
+            raise ValueError(f"{run}: {out.parent / other.name} has this agent with this seed")
+    out.parent.mkdir(exist_ok=True)
+    with files.replacing(out) as fresh:
+        fresh.mkdir()
+        if row.config is not None:
+            configs.save(row.config, fresh / CONFIG_FILE)
+        if row.metrics:
+            metrics = regular.read_bytes(run / METRICS_FILE, links=False)
+            (fresh / METRICS_FILE).write_bytes(metrics)
+        run_file.write(fresh, processes)
+        (fresh / report.EPISODES_FILE).write_bytes(records)
+        results = regular.read_bytes(run / report.RESULTS_FILE, links=False)
+        (fresh / report.RESULTS_FILE).write_bytes(results)
+    return out
+
+
+def _check(run: Path, row: Row) -> None:
+    """Raises FileError unless a run's results can be a row."""
+    results, path = row.results, run / report.RESULTS_FILE
+    split, policy = results["split"], results["policy"]
+    if results.get("departures"):
+        raise FileError(path, describe_departures(results["departures"]).replace("N", "n", 1))
+    if split not in NAMED:
+        raise FileError(path, f"split {split}: the scoreboard has {', '.join(NAMED)}")
+    version = episodes.stored_version(is_open(split))
+    if results.get("data") is not None:
+        raise FileError(path, f"in the rooms of {results['data']}: not in the bundled ones")
+    if results["data_version"] != version:
+        raise FileError(path, f"of scene tables {results['data_version']}, today's are {version}")
+    if results.get("targets", PAPER) != (OPEN if is_open(split) else PAPER):
+        raise FileError(path, f"targets {results['targets']}: not those of the split")
+    if row.config is None and policy not in (*UNTRAINED, CUSTOM):
+        raise FileError(run / CONFIG_FILE, "no such file; is this the folder of a run?")
+    if row.config is not None and policy != "sample":
+        raise FileError(path, f"{policy} actions: the scoreboard is of sampled ones")
+    if not (run / report.EPISODES_FILE).exists():
+        raise FileError(run / report.EPISODES_FILE, "no such file")
+
+
+def _processes(run: Path, row: Row, command: str | None, machine: str | None) -> list[Process]:
+    """The processes of a row, whose first one has the command and the machine that are given.
+
+    Raises:
+      ValueError: nobody says by which command the row was made.
+    """
+    first, *later = row.processes or [Process(commit=row.results.get("commit"))]
+    for flag, given, known in (
+        ("--command", command, first.command),
+        ("--machine", machine, first.machine),
+    ):
+        if given is not None and known is not None:
+            raise ValueError(f"{flag}: {run / run_file.RUN_FILE} says it")
+    first = dataclasses.replace(
+        first, command=first.command or command, machine=first.machine or machine
+    )
+    if first.command is None:
+        raise ValueError(f"{run}: no {run_file.RUN_FILE} says how it was made; give --command")
+    try:
+        return [
+            dataclasses.replace(one, command=one.command and _typed_anywhere(one.command))
+            for one in (first, *later)
+        ]
+    except ValueError as error:
+        raise ValueError(f"--command: {error}") from None
+
+
+def _typed_anywhere(command: str) -> str:
+    """A command without the folders of absolute paths."""
+
+    def cut(word: str) -> str:
+        flag, sign, value = word.partition("=") if word.startswith("-") else ("", "", word)
+        return f"{flag}{sign}{Path(value).name}" if Path(value).is_absolute() else word
+
+    return shlex.join(map(cut, shlex.split(command)))
+
+
+def _without_folders(config: TrainConfig) -> TrainConfig:
+    """A configuration that names its file of word vectors, but not the folder."""
+    path = config.word_vectors
+    return dataclasses.replace(config, word_vectors=path and Path(path).name)
+
+
+def _identity(row: Row) -> tuple[object, ...]:
+    """What no two rows share."""
+    return row.agent, row.results["split"], row.results["policy"], row.results["seed"]

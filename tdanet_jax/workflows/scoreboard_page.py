@@ -1,0 +1,176 @@
+"""The blocks of the documentation that are made from the scoreboard's rows.
+
+A block begins with `<!-- scoreboard: ... -->` and ends with `<!-- end -->`, each on a line of its
+own. If it names a split, it is that split's part of the scoreboard; if it names rows, a table of
+these.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from tdanet_jax.analysis import figures
+from tdanet_jax.evaluation import comparison, metrics, paper
+from tdanet_jax.io import files
+from tdanet_jax.io.escaping import in_markdown
+from tdanet_jax.io.untrusted import FileError
+from tdanet_jax.splits import GROUPS, NAMED, file_name
+from tdanet_jax.workflows.scoreboard import Row
+
+MARK = "<!-- scoreboard: "
+_BLOCK = re.compile(rf"^{MARK}([^\n]+) -->\n(.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
+
+
+def pages(root: Path | str, rows: Sequence[Row]) -> dict[Path, str]:
+    """Every page of a clone that has blocks, as the rows make it.
+
+    Args:
+      root: the clone's folder, with `README.md` and `docs/`.
+      rows: all rows.
+
+    Raises:
+      FileError: a block has no end, or names no row.
+    """
+    root = Path(root)
+    found = {path: path.read_text() for path in (root / "README.md", *root.glob("docs/**/*.md"))}
+    return {
+        path: filled(path, text, rows)
+        for path, text in found.items()
+        if re.search(f"^{MARK}", text, re.MULTILINE)
+    }
+
+
+def filled(path: Path, text: str, rows: Sequence[Row]) -> str:
+    """The text of a page with its blocks made from the rows.
+
+    Raises:
+      FileError: a block has no end, or names no row.
+    """
+    by_name = {row.name: row for row in rows}
+
+    def fill(block: re.Match[str]) -> str:
+        if MARK in block[2]:
+            raise FileError(path, f"{MARK}{block[1]} --> has no <!-- end -->")
+        if block[1] in NAMED:
+            lines = of_split(block[1], rows)
+        else:
+            if unknown := [name for name in block[1].split() if name not in by_name]:
+                raise FileError(path, f"scoreboard: no row {', '.join(unknown)}")
+            lines = of_rows([by_name[name] for name in block[1].split()])
+        return "\n".join([f"{MARK}{block[1]} -->", *lines, "<!-- end -->"])
+
+    out = _BLOCK.sub(fill, text)
+    if len(re.findall(f"^{MARK}", text, re.MULTILINE)) > len(_BLOCK.findall(text)):
+        raise FileError(path, f"a block {MARK}... --> has no <!-- end -->")
+    return out
+
+
+def of_rows(rows: Iterable[Row]) -> list[str]:
+    """A table of rows: SR and SPL of all episodes, with their intervals."""
+    bucket, measures = "L>=1", comparison.MEASURES
+    shown = [
+        (
+            (f"`results/{row.name}`",),
+            {
+                group: {bucket: {m: metrics.shown(row.results[group][bucket], m) for m in measures}}
+                for group in GROUPS
+                if row.results.get(group) is not None
+            },
+        )
+        for row in rows
+    ]
+    return comparison.table(("Row",), shown, buckets=(bucket,), measures=measures)
+
+
+def of_split(split: str, rows: Iterable[Row]) -> list[str]:
+    """A split's part of the scoreboard: its agents, the paper's, learning curves, and the runs."""
+    own = sorted((row for row in rows if row.results["split"] == split), key=lambda row: row.name)
+    agents: dict[str, list[Row]] = {}
+    for row in own:
+        agents.setdefault(row.agent, []).append(row)
+    summaries = {
+        agent: comparison.summary([row.results for row in seeds]) for agent, seeds in agents.items()
+    }
+    present = [group for group in GROUPS if any(out[group] for out in summaries.values())]
+    best_first = sorted(
+        agents, key=lambda agent: -(summaries[agent][present[-1]]["L>=1"]["SR"].mean)
+    )
+    shown = [(_of_agent(agent, agents[agent]), summaries[agent]) for agent in best_first] + [
+        ((f"{agent} (paper)", "", "", "", ""), groups)
+        for agent, groups in paper.rates(split).items()
+    ]
+    heads = ("Agent", "Senses beyond the paper's", "Seeds", "Steps", "Hours")
+    lines = comparison.table(heads, shown, groups=present, measures=("SR", "SPL", "CF-SR"))
+    if any(row.metrics for row in own):
+        name = picture(split)
+        lines += ["", f"![SR and SPL in the training rooms against environment steps]({name})"]
+    return ["", *lines, "", *_runs([row for agent in best_first for row in agents[agent]]), ""]
+
+
+def _of_agent(agent: str, seeds: Sequence[Row]) -> tuple[str, ...]:
+    """The cells of an agent before its results."""
+    steps = comparison.spread(row.results["steps"] / 1e6 for row in seeds)
+    hours = comparison.spread(row.hours for row in seeds)
+    trained = steps is not None and steps.mean > 0
+    return (
+        _code(agent),
+        ", ".join(map(in_markdown, seeds[0].senses)) or "none",
+        ", ".join(str(row.results["seed"]) for row in seeds) if trained else "",
+        f"{steps.mean:.1f} M" if steps is not None and trained else "",
+        f"{hours.mean:.1f}" if hours is not None else "",
+    )
+
+
+def _runs(rows: Iterable[Row]) -> list[str]:
+    """A table of who made each row, and how."""
+    heads = ("Row", "Hours", "Hardware", "Code", "Command")
+    lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
+    for row in rows:
+        cells = (
+            f"`results/{row.name}`",
+            "" if row.hours is None else f"{row.hours:.2f}",
+            _listed(map(in_markdown, (p.machine for p in row.processes if p.machine))),
+            _listed(map(in_markdown, (p.commit for p in row.processes if p.commit))),
+            _listed(_code(p.command) for p in row.processes if p.command),
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def _listed(texts: Iterable[str]) -> str:
+    return "; ".join(dict.fromkeys(texts))
+
+
+def _code(text: str) -> str:
+    return f"<code>{in_markdown(text)}</code>"
+
+
+def picture(split: str) -> str:
+    """The name of the file in `docs/` with a split's learning curves."""
+    return f"scoreboard-{file_name(split)}.png"
+
+
+def write(root: Path | str, rows: Sequence[Row]) -> list[Path]:
+    """Writes the blocks of all pages, and draws the learning curves.
+
+    Returns:
+      What was written: pages that were not up to date, and all pictures.
+
+    Raises:
+      FileError: a block has no end, or names no row.
+    """
+    root, written = Path(root), []
+    for path, text in pages(root, rows).items():
+        if path.read_text() != text:
+            files.write_text(path, text)
+            written.append(path)
+    for split in NAMED:
+        runs = [row for row in rows if row.results["split"] == split and row.metrics]
+        if runs:
+            path = root / "docs" / picture(split)
+            curves = [(row.agent, row.metrics) for row in runs]
+            figures.training_curves(curves, f"Split {split}, training rooms", path)
+            written.append(path)
+    return written
