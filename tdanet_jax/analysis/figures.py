@@ -63,7 +63,10 @@ def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> No
 
 
 def training_curves(
-    runs: Sequence[tuple[str, Sequence[dict[str, Any]]]], title: str, path: Path
+    runs: Sequence[tuple[str, Sequence[dict[str, Any]]]],
+    title: str,
+    path: Path,
+    comment: str | None = None,
 ) -> None:
     """SR and SPL in the training rooms against environment steps, a line for each run.
 
@@ -71,6 +74,7 @@ def training_curves(
       runs: a label and the rows of `metrics.jsonl` of each; runs of one label share a colour.
       title: above both panels.
       path: the picture's file.
+      comment: unseen, in the file; it must be a PNG then.
     """
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots(1, 2)
@@ -89,7 +93,7 @@ def training_curves(
     figure.legend(
         lines.values(), map(in_figure, lines), loc="outside lower center", ncols=2, frameon=False
     )
-    drawing.save(figure, path, DPI)
+    drawing.save(figure, path, DPI, comment)
 
 
 def scaling(rows: Sequence[dict[str, Any]], path: Path) -> None:
