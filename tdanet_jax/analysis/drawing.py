@@ -43,10 +43,14 @@ def formats() -> list[str]:
     return sorted(FigureCanvasBase.get_supported_filetypes())
 
 
-def save(figure: Figure, path: Path, dpi: int = DPI) -> None:
-    """Writes a figure, whole or not at all; the ending of `path` says in which format."""
+def save(figure: Figure, path: Path, dpi: int = DPI, comment: str | None = None) -> None:
+    """Writes a figure, whole or not at all; the ending of `path` says in which format.
+
+    Args:
+      comment: unseen, in a PNG file.
+    """
     with files.replacing(path) as fresh:
-        figure.savefig(fresh, dpi=dpi)
+        figure.savefig(fresh, dpi=dpi, metadata=None if comment is None else {"Comment": comment})
 
 
 def draw_view(

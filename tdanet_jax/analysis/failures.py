@@ -15,6 +15,7 @@ from tdanet_jax.analysis.episode_lookup import Recorded
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.io.escaping import in_markdown
+from tdanet_jax.scenes import camera_view
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.visibility.rules import RULES
 from tdanet_jax.vocabulary import Action
@@ -32,13 +33,13 @@ class Cause(NamedTuple):
 CAUSES = {
     "done_out_of_reach": Cause("Done out of reach", "Done with the target in view, out of reach"),
     "done_lost": Cause("Done, lost", "Done with the target out of view, which was in view before"),
-    "done_never_seen": Cause("Done, never seen", "Done, the target was never in view"),
-    "limit_in_reach": Cause("Done left out", "Step limit, the target was in reach"),
-    "limit_seen": Cause("Not reached", "Step limit, the target was in view but never in reach"),
-    "limit_never_seen": Cause("Not found", "Step limit, the target was never in view"),
+    "done_never_in_view": Cause("Done, never in view", "Done, the target was never in view"),
+    "limit_in_reach": Cause("In reach, no Done", "Step limit, the target was in reach"),
+    "limit_in_view": Cause("Not reached", "Step limit, the target was in view but never in reach"),
+    "limit_never_in_view": Cause("Not found", "Step limit, the target was never in view"),
 }
 TOO_EARLY = "done_out_of_reach"
-#: Upper edges of the bins of `Failure.missing_metres`; up to 0, the target is near enough, but too
+#: Upper edges of the bins of `Failure.missing_metres`; at 0, the target is near enough, but too
 #: little of it is in sight.
 METRES = (0.0, 0.1, 0.25, 0.5, 1.0, np.inf)
 METRES_NAMES = (
@@ -48,6 +49,7 @@ METRES_NAMES = (
     "0.25 to 0.50 m",
     "0.50 to 1 m",
     "more than 1 m",
+    "unknown",
 )
 
 
@@ -63,10 +65,11 @@ class Failure(NamedTuple):
     shortest: int  # L, actions on the shortest path from the start, including Done
     length: int  # actions taken
     #: How much nearer the agent had to be when it said Done, horizontally and in metres: 0 if it
-    #: was near enough. None unless it said Done with the target in view.
+    #: was near enough. None unless it said Done with the target in view, or if the rooms' file does
+    #: not tell where the target's sides are.
     missing_metres: float | None
     #: Actions, without Done, on the shortest path from where it said Done to where the target is in
-    #: reach. None likewise.
+    #: reach. None unless it said Done with the target in view.
     missing_actions: int | None
 
 
@@ -91,11 +94,11 @@ def find(records: Sequence[Recorded], tables: SceneTables, params: EnvParams) ->
     for i, record in enumerate(records):
         goal = int(starts.target[i])
         pose = poses[i, : len(record.actions) + 1]
-        in_reach, seen = tables.distance[pose, goal] == 0, in_view[pose, goal]
+        in_reach = tables.distance[pose, goal] == 0
         done = record.actions[-1] == Action.DONE
         if done and in_reach[-1]:
             continue
-        cause = _cause(bool(done), in_reach, seen)
+        cause = _cause(bool(done), in_reach, in_view[pose, goal])
         early = cause == TOO_EARLY
         found.append(
             Failure(
@@ -114,13 +117,13 @@ def find(records: Sequence[Recorded], tables: SceneTables, params: EnvParams) ->
     return found
 
 
-def _cause(done: bool, in_reach: np.ndarray, seen: np.ndarray) -> str:
+def _cause(done: bool, in_reach: np.ndarray, in_view: np.ndarray) -> str:
     """The cause, from what held at each pose [T + 1]."""
     if done:
-        return TOO_EARLY if seen[-1] else "done_lost" if seen.any() else "done_never_seen"
+        return TOO_EARLY if in_view[-1] else "done_lost" if in_view.any() else "done_never_in_view"
     if in_reach.any():
         return "limit_in_reach"
-    return "limit_seen" if seen.any() else "limit_never_seen"
+    return "limit_in_view" if in_view.any() else "limit_never_in_view"
 
 
 def _in_view(tables: SceneTables) -> np.ndarray:
@@ -135,12 +138,15 @@ def _in_view(tables: SceneTables) -> np.ndarray:
     return in_view
 
 
-def _missing(tables: SceneTables, pose: int, goal: int) -> float:
+def _missing(tables: SceneTables, pose: int, goal: int) -> float | None:
     """`Failure.missing_metres`: to the nearest target in view, minus the reach."""
-    rows = np.arange(tables.row_start[pose], tables.row_start[pose + 1])
-    name = tables.targets[goal]
-    rows = rows[[tables.classes[c] == name for c in tables.row_class[rows]]]
-    boxes = tables.object_box[tables.row_object[rows]][:, [0, 2, 3, 5]]
+    objects = tables.row_object[camera_view.rows_of_pose(tables, pose)]
+    named = [tables.classes[c] == tables.targets[goal] for c in tables.object_class[objects]]
+    boxes = tables.object_box[objects[named]]
+    # Imported rooms may know no box of an object, or a point alone.
+    boxes = boxes[(boxes[:, 3:] > boxes[:, :3]).any(axis=1)][:, [0, 2, 3, 5]]
+    if not len(boxes):
+        return None
     place = tables.position[tables.grid.split(pose).position][[0, 2]]
     away = np.maximum(np.maximum(boxes[:, :2] - place, place - boxes[:, 2:]), 0)
     return max(float(np.hypot(*away.T).min()) - RULES.reach, 0.0)
@@ -181,13 +187,11 @@ class Summary:
         return sum(all(getattr(f, k) == v for k, v in chosen.items()) for f in self.failures)
 
     def missing(self, group: str) -> np.ndarray:
-        """Failures too early by bin of METRES: [6] int."""
-        metres = [
-            f.missing_metres
-            for f in self.failures
-            if f.group == group and f.missing_metres is not None
-        ]
-        return np.bincount(np.searchsorted(METRES, metres), minlength=len(METRES))
+        """Failures by missing metres, as in METRES_NAMES: [7] int."""
+        early = [f for f in self.failures if (f.group, f.cause) == (group, TOO_EARLY)]
+        known = [f.missing_metres for f in early if f.missing_metres is not None]
+        counts = np.bincount(np.searchsorted(METRES, known), minlength=len(METRES))
+        return np.append(counts, len(early) - len(known))
 
     def rooms(self) -> list[dict[str, str]]:
         """The fields `group` and `room` of each kind of episode."""

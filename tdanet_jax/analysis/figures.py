@@ -63,7 +63,10 @@ def learning_curve(rows: Sequence[dict[str, Any]], title: str, path: Path) -> No
 
 
 def training_curves(
-    runs: Sequence[tuple[str, Sequence[dict[str, Any]]]], title: str, path: Path
+    runs: Sequence[tuple[str, Sequence[dict[str, Any]]]],
+    title: str,
+    path: Path,
+    comment: str | None = None,
 ) -> None:
     """SR and SPL in the training rooms against environment steps, a line for each run.
 
@@ -71,6 +74,7 @@ def training_curves(
       runs: a label and the rows of `metrics.jsonl` of each; runs of one label share a colour.
       title: above both panels.
       path: the picture's file.
+      comment: unseen, in the file; it must be a PNG then.
     """
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots(1, 2)
@@ -89,7 +93,7 @@ def training_curves(
     figure.legend(
         lines.values(), map(in_figure, lines), loc="outside lower center", ncols=2, frameon=False
     )
-    drawing.save(figure, path, DPI)
+    drawing.save(figure, path, DPI, comment)
 
 
 def scaling(rows: Sequence[dict[str, Any]], path: Path) -> None:
@@ -197,16 +201,22 @@ def failures(summary: Summary, path: Path, most: int = 20) -> None:
     _draw_causes(by_target, summary, targets, names)
     causes.set_xlabel("episodes that failed, per cent")
     by_target.set_xlabel("the same by target; * never a target in training")
-    width = 0.8 / max(len(groups), 1)
+    width = 0.8 / len(groups)
+    bins = len(METRES) + any(summary.missing(group)[-1] for group in summary.groups)
     for i, group in enumerate(summary.groups):
-        middles = np.arange(len(METRES)) + (i - (len(groups) - 1) / 2) * width
-        metres.bar(middles, summary.missing(group), width, color=("0.7", "0.3")[i], label=group)
-    names = [textwrap.fill(name, 14) for name in METRES_NAMES]
-    metres.set_xticks(range(len(METRES)), names, fontsize=8)
+        middles = np.arange(bins) + (i - (len(groups) - 1) / 2) * width
+        counts = summary.missing(group)[:bins]
+        metres.bar(middles, counts, width, color=("0.7", "0.3")[i], label=group)
+    wrapped = [textwrap.fill(name, 10) for name in METRES_NAMES[:bins]]
+    metres.set_xticks(range(bins), wrapped, fontsize=8)
     metres.set(xlabel="Done out of reach: how much nearer it had to be", ylabel="episodes")
     metres.legend(frameon=False)
     for axis in (causes, metres, by_target):
         axis.spines[["top", "right"]].set_visible(False)
+    if not summary.failures:
+        for axis in (causes, by_target):
+            axis.set_xlim(0, 1)
+        metres.set_ylim(0, 1)
     figure.suptitle(_in_lines(f"Failures of {summary.agent}, split {summary.split}"))
     handles, labels = causes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)

@@ -16,9 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from tdanet_jax import config as configs
 from tdanet_jax.agent import agent
 from tdanet_jax.analysis import attention
-from tdanet_jax.config import find_word_vectors
+from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import EnvParams, EnvState
 from tdanet_jax.evaluation import policies, rollout
@@ -95,12 +96,31 @@ def load_player(
     """
     run = find_run(run)
     config, weights, classes = agent.read(run)
-    path = find_word_vectors(config, folder_of(run), word_vectors)
-    task = task_in(rooms, dataclasses.replace(config.in_rooms_alone(), word_vectors=path))
+    config = _in_these_rooms(run, config, word_vectors)
+    task = task_in(rooms, config)
     task.check_known(run, classes.names)
     expected = task.model.parameter_shapes(*task.words.shape)
-    history.check_fit(run, weights, expected, None if path is None else task.words.shape[1])
+    width = None if config.word_vectors is None else task.words.shape[1]
+    history.check_fit(run, weights, expected, width)
     return Player(Path(run).resolve().name, task, task.model, weights, greedy)
+
+
+def load_task(run: Path | str, rooms: Rooms, word_vectors: Path | str | None = None) -> Task:
+    """The given rooms as a run's configuration shows them; arguments as for `load_player`.
+
+    The run's network is not read.
+
+    Raises:
+      ValueError: the folder holds no run, or a file cannot be read.
+    """
+    run = find_run(run)
+    return task_in(rooms, _in_these_rooms(run, configs.load(run / CONFIG_FILE), word_vectors))
+
+
+def _in_these_rooms(run: Path, config: TrainConfig, word_vectors: Path | str | None) -> TrainConfig:
+    """A run's configuration for the rooms that it is shown in, with the right word vectors."""
+    path = find_word_vectors(config, folder_of(run), word_vectors)
+    return dataclasses.replace(config.in_rooms_alone(), word_vectors=path)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +28,9 @@ from tdanet_jax.commands.one_episode import Choice
 from tdanet_jax.io.bundled_agents import folder_of
 
 if TYPE_CHECKING:
+    from tdanet_jax.analysis.episode_lookup import Recorded
     from tdanet_jax.analysis.failures import Summary
+    from tdanet_jax.scenes.dataset import Rooms
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,13 +40,19 @@ class Command:
     checkpoint: RunPath
     """Folder of a run, or a bundled agent's name."""
     replays: int = 5
-    """Failures to write as pages: of each cause in turn, the commonest first."""
+    """Failures to write as pages: of each cause in turn, the commonest first. Without any, the
+    run's network is not needed: rows of the scoreboard in results/ will do."""
     out: Path | None = None
     """Folder to write; by default <run>/failures."""
     data: str | None = None
     """File of rooms that `tdanet scenes import` wrote; by default, the run's rooms."""
     word_vectors: str | None = None
     """File of word vectors, instead of the copy that the run holds of its own."""
+
+    @property
+    def choice(self) -> Choice:
+        """The rooms and words, as the commands that show one episode take them."""
+        return Choice(data=self.data, word_vectors=self.word_vectors)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -61,32 +70,46 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _write(command: Command, out: Path) -> None:
     """Sorts, and writes the files."""
-    from tdanet_jax.analysis import episode_lookup, failures, figures, replay, trace
+    from tdanet_jax.analysis import episode_lookup, failures, figures, trace
     from tdanet_jax.io import files
     from tdanet_jax.training import devices
 
     devices.keep_compiled()
     devices.start()
-    run = command.checkpoint
-    choice = Choice(data=command.data, word_vectors=command.word_vectors)
-    player = one_episode.load_players(choice, [run], one_episode.rooms_of(choice, [run]))[0]
-    tables = player.task.tables
-    records = episode_lookup.read_records(run, tables)
+    run, choice = command.checkpoint, command.choice
+    rooms = one_episode.rooms_of(choice, [run])
+    task = trace.load_task(run, rooms, choice.word_vectors)
+    records = episode_lookup.read_records(run, task.tables)
     summary = failures.summarise(
-        player.name, player.task.split.name, records, tables, player.task.eval_params
+        run.resolve().name, task.split.name, records, task.tables, task.eval_params
     )
+    shown = {f"episode-{f.episode}.html": f for f in failures.examples(summary, command.replays)}
+    pages = _pages(command, rooms, {name: records[f.episode] for name, f in shown.items()})
     out.mkdir(parents=True, exist_ok=True)
-    pages = {f"episode-{f.episode}.html": f for f in failures.examples(summary, command.replays)}
-    for page, failure in pages.items():
-        record = records[failure.episode]
-        shown = trace.retrace(player, tables, record.episode, record.actions)
-        files.write_text(out / page, replay.page([shown], tables))
+    for old in out.glob("episode-*.html"):
+        old.unlink()
+    for name, page in pages.items():
+        files.write_text(out / name, page)
     figures.failures(summary, out / "failures.png")
     files.write_text(out / "failures.json", json.dumps(failures.to_json(summary), indent=1) + "\n")
-    files.write_text(out / "failures.md", failures.markdown(summary, "failures.png", pages))
+    files.write_text(out / "failures.md", failures.markdown(summary, "failures.png", shown))
     _print(summary)
     written = "failures.md, .json and .png"
     console.print(f"wrote {out / written}" + (f" and {len(pages)} replays" if pages else ""))
+
+
+def _pages(command: Command, rooms: Rooms, chosen: Mapping[str, Recorded]) -> dict[str, str]:
+    """Replays of recorded episodes, by file name; only they need the run's network."""
+    from tdanet_jax.analysis import replay, trace
+
+    if not chosen:
+        return {}
+    player = one_episode.load_players(command.choice, [command.checkpoint], rooms)[0]
+    tables = player.task.tables
+    return {
+        name: replay.page([trace.retrace(player, tables, one.episode, one.actions)], tables)
+        for name, one in chosen.items()
+    }
 
 
 def _print(summary: Summary) -> None:

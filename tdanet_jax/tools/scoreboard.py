@@ -1,7 +1,7 @@
 """Adds a row to the scoreboard, or makes the tables and pictures of the documentation from it.
 
-python -m tdanet_jax.tools.scoreboard add runs/mine --name 18-4-mine-0
-python -m tdanet_jax.tools.scoreboard write
+    python -m tdanet_jax.tools.scoreboard add runs/mine --name 18-4-mine-0
+    python -m tdanet_jax.tools.scoreboard write
 
 In a clone: rows are folders of results/.
 """
@@ -28,7 +28,7 @@ class Add:
     name: str
     """Name of the row: of its folder in results/."""
     command: str | None = None
-    """The command by which it was made, in quotes, if its run.json does not tell."""
+    """The one plain command by which it was made, in quotes, if its run.json does not tell."""
     machine: str | None = None
     """Where it was made, such as "AMD EPYC 7B13, 2 cores", if its run.json does not tell."""
 
@@ -48,10 +48,10 @@ class Write:
         """Runs the command."""
         from tdanet_jax.workflows import scoreboard, scoreboard_page
 
-        written = scoreboard_page.write(ROOT, scoreboard.rows(RESULTS))
-        for path in written:
-            console.print(f"wrote {path.relative_to(ROOT)}")
-        if not written:
+        changed = scoreboard_page.write(ROOT, scoreboard.rows(RESULTS))
+        for path in changed:
+            console.print(f"{'wrote' if path.exists() else 'deleted'} {path.relative_to(ROOT)}")
+        if not changed:
             console.print("everything is up to date")
 
 

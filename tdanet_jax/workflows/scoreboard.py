@@ -8,28 +8,47 @@ A folder of `results/` is a row. It holds `results.json` and `episodes.jsonl`, w
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
 
 from tdanet_jax import config as configs
+from tdanet_jax.analysis import episode_lookup
 from tdanet_jax.config import CONFIG_FILE, PRESETS, TrainConfig, describe_departures
-from tdanet_jax.evaluation import comparison, episodes, report, results_file
+from tdanet_jax.evaluation import comparison, episodes, metrics, report, results_file, rollout
 from tdanet_jax.evaluation.comparison import Result
+from tdanet_jax.evaluation.policies import Policy
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import FileError, jsons, regular
-from tdanet_jax.splits import NAMED, OPEN, is_open
+from tdanet_jax.splits import GROUPS, NAMED, OPEN, is_open, make_split
 from tdanet_jax.targets import PAPER
+from tdanet_jax.task import Task, load_task
 from tdanet_jax.training import journal, run_file
 from tdanet_jax.training.journal import METRICS_FILE
 from tdanet_jax.training.run_file import Process
+from tdanet_jax.vocabulary import Action
 from tdanet_jax.workflows.evaluate import UNTRAINED
 
 #: Flags that do not tell agents apart here. The last two are what "auto" became on a machine.
 _SHARED = (*comparison.NOT_SETTINGS, "--split", "--model", "--precision", "--image")
 #: `model` of a policy of one's own in its `results.json`.
 CUSTOM = "custom"
+#: What can stand in a command that every shell takes as it is, besides letters and digits.
+_PLAIN = r"[\w @%+=:,./'\"-]"
+#: Folders that may name their owner: of absolute paths, of those from ~, and of those with "..".
+_FOLDERS = re.compile(r"(^|[\s=:,])(?:/|~[^\s=:,/]*|(?:[^\s=:,]*/)?\.\./)(?:[^=:,]*/)?")
+#: Takes the actions [B, N] that are given as its weights.
+_RECORDED = Policy(
+    start=lambda actions, batch: jnp.int32(0),
+    act=lambda actions, step, key, state, params: (step + 1, actions[:, step]),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,10 +72,11 @@ class Row:
         return " ".join([self.config.model, *chosen, *differing[preset]])
 
     @property
-    def senses(self) -> list[str]:
-        """What the agent senses beyond the paper's inputs."""
-        scores = self.config is not None and self.config.network.scores
-        return [*self.results.get("sensors", ()), *["scores"] * scores]
+    def senses(self) -> list[str] | None:
+        """What the agent senses beyond the paper's inputs; None if unknown."""
+        if self.config is None:
+            return None
+        return [*self.results.get("sensors", ()), *["scores"] * self.config.network.scores]
 
     @property
     def hours(self) -> float | None:
@@ -66,13 +86,22 @@ class Row:
 
 
 def _differing(config: TrainConfig, preset: TrainConfig) -> list[str]:
-    """The flags in which a configuration differs from a preset, with its values."""
+    """The flags in which a configuration differs from a preset, with its values, as typed.
+
+    A limit of the preset that it has not is left out: another one takes its place.
+    """
     values, usual = comparison.flags(config), comparison.flags(preset)
     return [
-        comparison.setting(flag, value)
+        _typed(flag, value)
         for flag, value in values.items()
-        if flag not in _SHARED and value != usual[flag]
+        if flag not in _SHARED and value is not None and value != usual[flag]
     ]
+
+
+def _typed(flag: str, value: Any) -> str:
+    if isinstance(value, bool):
+        return flag if value else f"--no-{flag.removeprefix('--')}"
+    return f"{flag} {value}"
 
 
 def rows(folder: Path | str) -> list[Row]:
@@ -133,19 +162,25 @@ def add(
 
     Raises:
       ValueError: a file is missing or cannot be read, it is no result of the official test in
-        today's rooms, or the name or the seed are there already; one line that names it.
+        today's rooms, its code was not committed, or the name or the seed are there already; one
+        line that names it.
     """
     run, out = Path(run), Path(folder) / name
     if not re.fullmatch(r"\w[\w.-]*", name):
-        raise ValueError(f"--name {name}: use letters, digits, dots and hyphens")
+        raise ValueError(f"--name {name}: letters, digits and _; after the first, . and - as well")
+    if name in NAMED:
+        raise ValueError(f"--name {name}: is the name of a split")
     if out.exists():
         raise ValueError(f"--name {name}: {out} exists")
     if not (run / report.RESULTS_FILE).exists():
         raise FileError(run / report.RESULTS_FILE, "no such file; is the run finished?")
     row = dataclasses.replace(read(run), name=name)
-    _check(run, row)
-    records = regular.read_bytes(run / report.EPISODES_FILE, links=False)
     processes = _processes(run, row, command, machine)
+    for commit in (row.results.get("commit"), *(process.commit for process in row.processes)):
+        if str(commit).endswith("-dirty"):
+            raise ValueError(f"{run}: made with changes that are not committed, {commit}")
+    check(run, row)
+    records = regular.read_bytes(run / report.EPISODES_FILE, links=False)
     if row.config is not None:
         row = dataclasses.replace(row, config=_without_folders(row.config))
     for other in rows(folder):
@@ -166,12 +201,17 @@ def add(
     return out
 
 
-def _check(run: Path, row: Row) -> None:
-    """Raises FileError unless a run's results can be a row."""
+def check(run: Path, row: Row) -> None:
+    """Raises ValueError unless results are those of the official test, as its episodes give them.
+
+    Args:
+      run: the folder of the run, or of the row.
+      row: what was read from it.
+    """
     results, path = row.results, run / report.RESULTS_FILE
     split, policy = results["split"], results["policy"]
     if results.get("departures"):
-        raise FileError(path, describe_departures(results["departures"]).replace("N", "n", 1))
+        raise FileError(path, describe_departures(results["departures"]))
     if split not in NAMED:
         raise FileError(path, f"split {split}: the scoreboard has {', '.join(NAMED)}")
     version = episodes.stored_version(is_open(split))
@@ -187,6 +227,46 @@ def _check(run: Path, row: Row) -> None:
         raise FileError(path, f"{policy} actions: the scoreboard is of sampled ones")
     if not (run / report.EPISODES_FILE).exists():
         raise FileError(run / report.EPISODES_FILE, "no such file")
+    _check_episodes(run, results)
+
+
+def _check_episodes(run: Path, results: Result) -> None:
+    """Raises ValueError unless the episodes are the test's, and the results follow from them.
+
+    The recorded actions are taken again in the official episodes.
+    """
+    path, split = run / report.EPISODES_FILE, results["split"]
+    task = _task(is_open(split))
+    lists = episodes.load(task.tables, make_split(split))
+    records = episode_lookup.read_records(run, task.tables)
+    if [record.group for record in records] != [g for g, one in lists.items() for _ in one.pose]:
+        raise FileError(path, f"not the {sum(map(len, lists.values())):,} test episodes of {split}")
+    limit = int(task.eval_params.step_limit.max())
+    actions = np.full((len(records), limit), Action.DONE)
+    for row, record in zip(actions, records, strict=True):
+        row[: len(record.actions)] = record.actions[:limit]
+    played = {}
+    for group, chosen in lists.items():
+        own = jnp.asarray(actions[[record.group == group for record in records]])
+        params, key = task.eval_params, jax.random.key(0)
+        played[group] = chosen, rollout.evaluate(_RECORDED, own, params, chosen, key)
+    expected = report.all_rows(task.tables, played)
+    for (number, line), right in zip(jsons.load_lines(path, links=False), expected, strict=True):
+        if line != right:
+            raise FileError(f"{path}, line {number}", "not what these actions do in this episode")
+    summaries = {}
+    for group, pair in played.items():
+        columns = report.columns(task.tables, *pair, by_class=is_open(split))
+        summaries[group] = metrics.summarise(*(columns[name] for name in metrics.COLUMNS))
+    for group in GROUPS:
+        if results.get(group) != summaries.get(group):
+            raise FileError(run / report.RESULTS_FILE, f"{group}: not what the episodes give")
+
+
+@functools.cache
+def _task(of_open: bool) -> Task:
+    """The rooms in which the open-vocabulary benchmark, or any other split, is played."""
+    return load_task(TrainConfig(split=OPEN if of_open else TrainConfig().split))
 
 
 def _processes(run: Path, row: Row, command: str | None, machine: str | None) -> list[Process]:
@@ -202,10 +282,12 @@ def _processes(run: Path, row: Row, command: str | None, machine: str | None) ->
     ):
         if given is not None and known is not None:
             raise ValueError(f"{flag}: {run / run_file.RUN_FILE} says it")
+    if command is not None and (found := re.sub(_PLAIN, "", command)):
+        raise ValueError(f"--command: give one plain command, without {found[0]!r}")
     first = dataclasses.replace(
         first, command=first.command or command, machine=first.machine or machine
     )
-    if first.command is None:
+    if not first.command:
         raise ValueError(f"{run}: no {run_file.RUN_FILE} says how it was made; give --command")
     try:
         return [
@@ -213,17 +295,13 @@ def _processes(run: Path, row: Row, command: str | None, machine: str | None) ->
             for one in (first, *later)
         ]
     except ValueError as error:
-        raise ValueError(f"--command: {error}") from None
+        where = run / run_file.RUN_FILE if command is None else "--command"
+        raise ValueError(f"{where}: {error}") from None
 
 
 def _typed_anywhere(command: str) -> str:
-    """A command without the folders of absolute paths."""
-
-    def cut(word: str) -> str:
-        flag, sign, value = word.partition("=") if word.startswith("-") else ("", "", word)
-        return f"{flag}{sign}{Path(value).name}" if Path(value).is_absolute() else word
-
-    return shlex.join(map(cut, shlex.split(command)))
+    """A command without the folders that may name their owner."""
+    return shlex.join(_FOLDERS.sub(r"\1", word) for word in shlex.split(command))
 
 
 def _without_folders(config: TrainConfig) -> TrainConfig:

@@ -7,7 +7,10 @@ these.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
+import statistics
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -112,14 +115,15 @@ def of_split(split: str, rows: Iterable[Row]) -> list[str]:
 def _of_agent(agent: str, seeds: Sequence[Row]) -> tuple[str, ...]:
     """The cells of an agent before its results."""
     steps = comparison.spread(row.results["steps"] / 1e6 for row in seeds)
-    hours = comparison.spread(row.hours for row in seeds)
+    hours = [row.hours for row in seeds if row.hours is not None]
     trained = steps is not None and steps.mean > 0
+    senses = seeds[0].senses
     return (
         _code(agent),
-        ", ".join(map(in_markdown, seeds[0].senses)) or "none",
+        "" if senses is None else ", ".join(map(in_markdown, senses)) or "none",
         ", ".join(str(row.results["seed"]) for row in seeds) if trained else "",
         f"{steps.mean:.1f} M" if steps is not None and trained else "",
-        f"{hours.mean:.1f}" if hours is not None else "",
+        f"{statistics.fmean(hours):.2f}" if len(hours) == len(seeds) else "",
     )
 
 
@@ -153,24 +157,29 @@ def picture(split: str) -> str:
 
 
 def write(root: Path | str, rows: Sequence[Row]) -> list[Path]:
-    """Writes the blocks of all pages, and draws the learning curves.
+    """Writes the blocks of all pages, and draws the learning curves that have changed.
 
     Returns:
-      What was written: pages that were not up to date, and all pictures.
+      What was not up to date; pictures without rows are deleted.
 
     Raises:
       FileError: a block has no end, or names no row.
     """
-    root, written = Path(root), []
+    root, changed = Path(root), []
     for path, text in pages(root, rows).items():
         if path.read_text() != text:
             files.write_text(path, text)
-            written.append(path)
+            changed.append(path)
     for split in NAMED:
+        path = root / "docs" / picture(split)
+        before = path.read_bytes() if path.exists() else None
         runs = [row for row in rows if row.results["split"] == split and row.metrics]
-        if runs:
-            path = root / "docs" / picture(split)
-            curves = [(row.agent, row.metrics) for row in runs]
-            figures.training_curves(curves, f"Split {split}, training rooms", path)
-            written.append(path)
-    return written
+        curves = [(row.agent, row.metrics) for row in runs]
+        mark = hashlib.sha256(json.dumps(curves).encode()).hexdigest()
+        if not curves and before is not None:
+            path.unlink()
+            changed.append(path)
+        elif curves and (before is None or mark.encode() not in before):
+            figures.training_curves(curves, f"Split {split}, training rooms", path, mark)
+            changed.append(path)
+    return changed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections import Counter
@@ -71,11 +72,11 @@ def expected(world, record):
     if record.actions[-1] != DONE:
         if any(reach):
             return "limit_in_reach", None
-        return "limit_seen" if any(view) else "limit_never_seen", None
+        return "limit_in_view" if any(view) else "limit_never_in_view", None
     if reach[-1]:
         return None
     if not view[-1]:
-        return "done_lost" if any(view) else "done_never_seen", None
+        return "done_lost" if any(view) else "done_never_in_view", None
     x, _, z = world.tables.position[path[-1].position]
     away = []
     for row in world.rows(states[-1]):
@@ -128,8 +129,8 @@ def summary():
     listed = [
         *(failure(i, early, missing_metres=m, missing_actions=i + 1) for i, m in enumerate(metres)),
         failure(4, early, "Vase", missing_metres=0.7, missing_actions=9),
-        failure(5, "limit_seen", "Vase"),
-        failure(6, "limit_seen", "Toaster", "unseen"),
+        failure(5, "limit_in_view", "Vase"),
+        failure(6, "limit_in_view", "Toaster", "unseen"),
     ]
     played = {
         ("seen", "kitchen", "Mug"): 10,
@@ -143,9 +144,9 @@ def summary():
 def test_counts(summary):
     assert summary.episodes(group="seen") == 20
     assert summary.episodes(target="Mug") == 10
-    assert summary.count(group="seen", cause="limit_seen") == 1
-    assert summary.missing("seen").tolist() == [1, 1, 1, 0, 1, 1]
-    assert summary.missing("unseen").tolist() == [0] * 6
+    assert summary.count(group="seen", cause="limit_in_view") == 1
+    assert summary.missing("seen").tolist() == [1, 1, 1, 0, 1, 1, 0]
+    assert summary.missing("unseen").tolist() == [0] * 7
     # 2 of 4, 4 of 10, 1 of 5; Bread never failed.
     assert [key["target"] for key in summary.targets()] == ["Vase", "Mug", "Toaster"]
 
@@ -154,9 +155,9 @@ def test_examples_are_of_every_cause_and_target_in_turn(summary):
     chosen = failures.examples(summary, 4)
     assert [(f.cause, f.target) for f in chosen] == [
         ("done_out_of_reach", "Vase"),
-        ("limit_seen", "Vase"),
+        ("limit_in_view", "Vase"),
         ("done_out_of_reach", "Mug"),
-        ("limit_seen", "Toaster"),
+        ("limit_in_view", "Toaster"),
     ]
     assert failures.examples(summary, 0) == []
     everything = failures.examples(summary, 99)
@@ -178,6 +179,50 @@ def test_the_picture_is_drawn_with_and_without_failures(summary, tmp_path):
     figures.failures(summary, tmp_path / "some.png")
     figures.failures(Summary("mine", "18/4", [], summary.played), tmp_path / "none.png")
     assert (tmp_path / "some.png").stat().st_size > (tmp_path / "none.png").stat().st_size > 1000
+
+
+def test_sides_that_a_file_of_rooms_does_not_tell_are_unknown(
+    some_rooms, task, records, found, tmp_path
+):
+    early = [f for f in found if f.missing_metres is not None]
+    boxes = some_rooms.object_box.copy()
+    targets = [some_rooms.classes.index(name) for name in {f.target for f in early}]
+    of_targets = np.flatnonzero(np.isin(some_rooms.object_class, targets))
+    boxes[of_targets[::2]] = np.nan
+    boxes[of_targets[1::2], 3:] = boxes[of_targets[1::2], :3]  # a point
+    tables = dataclasses.replace(some_rooms, object_box=boxes)
+    summary = failures.summarise("mine", "18/4", records, tables, task.eval_params)
+    assert [f.cause for f in summary.failures] == [f.cause for f in found]
+    assert {f.missing_metres for f in summary.failures} == {None}
+    counts = sum(summary.missing(group) for group in ("seen", "unseen"))
+    assert counts.tolist() == [0] * 6 + [len(early)]
+    assert f"| unknown | {summary.missing('seen')[-1]} |" in failures.markdown(summary, "", {})
+    figures.failures(summary, tmp_path / "unknown.png")
+    json.loads(json.dumps(failures.to_json(summary), allow_nan=False))
+
+
+def test_an_object_without_a_box_in_the_image_is_not_the_nearest_in_view(some_rooms, task):
+    """It can be visible where imported data say so, but nobody sees it."""
+    goal = some_rooms.targets.index("Painting")
+    shown = some_rooms.row_class == some_rooms.classes.index("Painting")
+    per_state = np.bincount(some_rooms.row_state[shown & ~some_rooms.row_visible])
+    pose = int(per_state.argmax())
+    rows = np.arange(some_rooms.row_start[pose], some_rooms.row_start[pose + 1])[
+        shown[some_rooms.row_start[pose] : some_rooms.row_start[pose + 1]]
+    ]
+    assert len(rows) > 1
+    x, z = some_rooms.position[some_rooms.grid.split(pose).position][[0, 2]]
+    b = some_rooms.object_box[some_rooms.row_object[rows]]
+    away = np.hypot(
+        np.maximum(np.maximum(b[:, 0] - x, x - b[:, 3]), 0),
+        np.maximum(np.maximum(b[:, 2] - z, z - b[:, 5]), 0),
+    )
+    hidden = some_rooms.row_box.copy()
+    hidden[rows[away.argmin()]] = -1
+    tables = dataclasses.replace(some_rooms, row_box=hidden)
+    start = Episodes(np.array([pose]), np.array([goal]))
+    (failed,) = failures.find([Recorded(start, np.array([DONE]), "seen")], tables, task.eval_params)
+    assert failed.missing_metres == pytest.approx(max(np.sort(away)[1] - REACH, 0))
 
 
 def test_json_holds_every_failure(summary):

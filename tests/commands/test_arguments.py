@@ -183,7 +183,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
     "failures": [
         ("", "Missing from tdanet failures: --checkpoint RUN"),
         ("--checkpoint nowhere", "nowhere/config.json: no such file"),
-        ("--checkpoint bare", "bare/checkpoints: no checkpoint"),
+        ("--checkpoint bare", "bare/episodes.jsonl: no such file; a run writes it when training"),
         ("--checkpoint bare --replays=-1", "--replays -1: must not be negative"),
         ("--checkpoint bare --out full/file/a", "full/file/a: Not a directory"),
         ("--checkpoint bare --data nowhere.npz", "nowhere.npz: no such file"),

@@ -232,6 +232,7 @@ def prepare_failures(recorder: Recorder) -> None:
     player = SimpleNamespace(name="one", task=task)
     recorder.record("tdanet_jax.scenes.dataset.load_rooms", gives=Rooms(task.tables, None))
     recorder.record("tdanet_jax.scenes.target_distances.with_targets", gives=task.tables)
+    recorder.record("tdanet_jax.analysis.trace.load_task", gives=task)
     recorder.record("tdanet_jax.analysis.trace.load_player", gives=player)
     recorder.record(f"{EPISODE}.read_records", gives=list)
     recorder.record("tdanet_jax.analysis.failures.summarise", gives="a summary")
