@@ -43,9 +43,11 @@ if TYPE_CHECKING:
     from tdanet_jax.tools.benchmarking import Row
 
 Part = Literal[
-    "tables", "import", "startup", "machine", "environment", "rollout", "update", "evaluation",
-    "decision", "agent", "quality",
+    "tables", "import", "startup", "machine", "environment", "rollout", "update", "profile",
+    "evaluation", "decision", "agent", "quality",
 ]  # fmt: skip
+#: The parts of training.
+TRAINED = {"rollout", "update", "profile"}
 #: The agent of the `agent` part.
 BUNDLED = "18-4-best"
 #: What is measured if `--parts` is not given: all that takes no training.
@@ -62,16 +64,16 @@ class Command:
     environments: tuple[int, ...] = (1024, 4096, 16384)
     """Numbers of environments in the `environment` part."""
     batches: tuple[int, ...] = (256, 512, 1024)
-    """Numbers of environments in the `rollout` and `update` parts."""
+    """Numbers of environments in the `rollout`, `update` and `profile` parts."""
     precisions: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
-    """Precision of the matrix products in the `rollout` and `update` parts."""
+    """Precision of the matrix products in these parts."""
     networks: tuple[int, ...] = (1,)
     """Numbers of networks that are evaluated in one call; 20 is a run's history."""
     checkpoint: RunPath | None = None
     """Run whose trained network the `evaluation` part plays, by default an untrained one, and with
     which the `agent` part acts, by default 18-4-best."""
     models: tuple[str, ...] = ("tdanet",)
-    """Models of the `rollout`, `update` and `decision` parts."""
+    """Models of the `rollout`, `update`, `profile` and `decision` parts."""
     odometry: bool = False
     """Give these models odometry, as the training command does."""
     triangulation: bool = False
@@ -126,7 +128,7 @@ def main(arguments: list[str] | None = None) -> None:
             config.check()
         for name in command.models:
             command.config(name).check()
-        if command.odometry and not {"rollout", "update", "decision"} & set(command.parts):
+        if command.odometry and not {*TRAINED, "decision"} & set(command.parts):
             fail("--odometry: none of the --parts has a model; choose rollout, update or decision")
         if command.checkpoint is not None:
             from tdanet_jax.evaluation import saved_networks
@@ -208,7 +210,7 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
     from tdanet_jax.tools import benchmarking
 
     repeats, measured = command.repeats, set()
-    for asked in command.precisions if {"rollout", "update"} & set(command.parts) else ():
+    for asked in command.precisions if TRAINED & set(command.parts) else ():
         task = load_task(command.config(name, asked))
         precision = jnp.dtype(task.model.dtype).name
         if precision in measured:  # some models always multiply in float32
@@ -221,6 +223,10 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
                 row = benchmarking.update_row(task, count, repeats)
                 share = benchmarking.share_of_peak(task, row, peak) if name == "tdanet" else {}
                 yield {**row, **share, "precision": precision}
+            if "profile" in command.parts:
+                from tdanet_jax.tools import profiling
+
+                yield profiling.profile_row(task, count) | {"precision": precision}
     if "decision" in command.parts:
         task = load_task(command.config(name))
         for count in (1, 1024):

@@ -102,6 +102,7 @@ def init(
     )
 
 
+@jax.named_scope("environment")
 def _reset(key: jax.Array, params: EnvParams, batch: int) -> EnvState:
     return jax.vmap(dynamics.reset_state, (0, None))(jax.random.split(key, batch), params)
 
@@ -119,8 +120,9 @@ def rollout(
     Returns:
       The state after it, what happened, and the value of each last state [B].
     """
-    observe = jax.vmap(dynamics.observe, (0, None))
-    transition = jax.vmap(dynamics.transition, (0, 0, None))
+    scope = jax.named_scope("environment")
+    observe = scope(jax.vmap(dynamics.observe, (0, None)))
+    transition = scope(jax.vmap(dynamics.transition, (0, 0, None)))
     # Cast once per rollout what every step would cast: the kernels of the large products.
     weights = jax.tree.map(
         lambda x: x.astype(model.dtype) if x.ndim > 1 and x.size > SMALL else x, state.params
@@ -247,17 +249,18 @@ def update(
     (total, parts), grads = jax.value_and_grad(loss, has_aux=True)(
         state.params, steps, advantage, state.recurrent.carry, entropy_weight, config, model, words
     )
-    grad_norm = optax.tree.norm(grads)
-    finite = jnp.isfinite(total) & jnp.isfinite(grad_norm)
-    scaled, opt_state = make_optimizer(config).update(grads, state.opt_state, state.params)
     rate = mix(config.learning_rate, config.final_learning_rate)
-    weights = jax.tree.map(lambda p, g: p - rate * g, state.params, scaled)
-    # A non-finite loss or gradient must not reach the parameters: the update is skipped, counted.
-    weights, opt_state = jax.tree.map(
-        lambda new, old: jnp.where(finite, new, old),
-        (weights, opt_state),
-        (state.params, state.opt_state),
-    )
+    with jax.named_scope("optimizer"):
+        grad_norm = optax.tree.norm(grads)
+        finite = jnp.isfinite(total) & jnp.isfinite(grad_norm)
+        scaled, opt_state = make_optimizer(config).update(grads, state.opt_state, state.params)
+        weights = jax.tree.map(lambda p, g: p - rate * g, state.params, scaled)
+        # A non-finite loss or gradient must not reach the parameters: the update is skipped.
+        weights, opt_state = jax.tree.map(
+            lambda new, old: jnp.where(finite, new, old),
+            (weights, opt_state),
+            (state.params, state.opt_state),
+        )
     after = after.replace(
         params=weights,
         opt_state=opt_state,

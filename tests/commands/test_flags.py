@@ -144,6 +144,7 @@ def prepare_benchmark(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.evaluation.saved_networks.find", gives=None)
     recorder.record("tdanet_jax.tools.benchmarking.share_of_peak", gives=dict)
     recorder.record("tdanet_jax.tools.benchmarking.machine_row", *BENCHMARKS, gives=row)
+    recorder.record("tdanet_jax.tools.profiling.profile_row", gives=row)
     recorder.record("tdanet_jax.tools.quality.quality_row", gives=row)
     for part in ("tables", "import", "startup"):
         recorder.record(f"tdanet_jax.commands.benchmark.{part}_row", gives=row)
