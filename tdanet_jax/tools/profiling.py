@@ -64,7 +64,7 @@ def profile_row(task: Task, count: int) -> Row:
             jax.block_until_ready(compiled(state, *arguments))
             seconds = time.perf_counter() - began
         durations = _durations(Path(place))
-    spent = sort(durations, places(compiled.as_text()))
+    spent = sort(durations, places(compiled.as_text() or ""))
     total = sum(spent.values())
     if not total:
         raise ValueError("profile: this device's profiler names no operations")
