@@ -15,6 +15,7 @@ from tdanet_jax.analysis.episode_lookup import Recorded, read_records
 from tdanet_jax.analysis.failures import CAUSES, Failure, Summary
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.io import bundled_agents
 from tdanet_jax.io.bundled_agents import find_run
 from tdanet_jax.task import make_task
 from tdanet_jax.vocabulary import ACTION_NAMES
@@ -233,7 +234,7 @@ def test_json_holds_every_failure(summary):
     assert len(out["failures"]) == 7
 
 
-@pytest.mark.parametrize("agent", ["18-4-best", "18-4-robust"])
+@pytest.mark.parametrize("agent", bundled_agents.names())
 def test_the_bundled_agents_fail_as_often_as_their_results_say(ithor, glove, agent):
     run, params = find_run(agent), make_task(TINY, ithor, glove).eval_params
     summary = failures.summarise(agent, "18/4", read_records(run, ithor), ithor, params)
