@@ -100,12 +100,13 @@ def of_split(split: str, rows: Iterable[Row]) -> list[str]:
     best_first = sorted(
         agents, key=lambda agent: -(summaries[agent][present[-1]]["L>=1"]["SR"].mean)
     )
+    published = paper.rates(split)
     shown = [(_of_agent(agent, agents[agent]), summaries[agent]) for agent in best_first] + [
-        ((f"{agent} (paper)", "", "", "", ""), groups)
-        for agent, groups in paper.rates(split).items()
+        ((f"{agent} (paper)", "", "", "", ""), groups) for agent, groups in published.items()
     ]
     heads = ("Agent", "Senses beyond the paper's", "Seeds", "Steps", "Hours")
     lines = comparison.table(heads, shown, groups=present, measures=("SR", "SPL", "CF-SR"))
+    lines += ["", paper.worlds(None)] if published else []
     if any(row.metrics for row in own):
         name = picture(split)
         lines += ["", f"![SR and SPL in the training rooms against environment steps]({name})"]
