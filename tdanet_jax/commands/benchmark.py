@@ -129,7 +129,7 @@ def main(arguments: list[str] | None = None) -> None:
         for name in command.models:
             command.config(name).check()
         if command.odometry and not {*TRAINED, "decision"} & set(command.parts):
-            fail("--odometry: none of the --parts has a model; choose rollout, update or decision")
+            fail("--odometry: give --parts that have a model: rollout, update, profile or decision")
         if command.checkpoint is not None:
             from tdanet_jax.evaluation import saved_networks
 

@@ -92,7 +92,7 @@ def labels(results: Sequence[Result], names: Sequence[str]) -> list[str]:
     for kind, name in zip(kinds, names, strict=True):
         rivals = [dict(other.values) for other in kinds if other.model == kind.model]
         differing = [
-            setting(flag, value)
+            _shown(flag, value)
             for flag, value in kind.values
             if (flag in BEYOND and value) or any(rival.get(flag) != value for rival in rivals)
         ]
@@ -100,7 +100,7 @@ def labels(results: Sequence[Result], names: Sequence[str]) -> list[str]:
     return out
 
 
-def setting(flag: str, value: Any) -> str:
+def _shown(flag: str, value: Any) -> str:
     """A flag and its value in words: --odometry, no --scores, --gamma 0.97."""
     if value is None or value is False:
         return f"no {flag}"

@@ -38,7 +38,7 @@ from tdanet_jax.workflows.evaluate import UNTRAINED
 
 #: Flags that do not tell agents apart here. The last two are what "auto" became on a machine.
 _SHARED = (*comparison.NOT_SETTINGS, "--split", "--model", "--precision", "--image")
-#: `model` of a policy of one's own in its `results.json`.
+#: The value of `model` in the `results.json` of a custom policy.
 CUSTOM = "custom"
 #: What can stand in a command that every shell takes as it is, besides letters and digits.
 _PLAIN = r"[\w @%+=:,./'\"-]"
