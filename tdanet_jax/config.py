@@ -182,6 +182,11 @@ class TrainConfig:
     generated_only: bool = False
     """Requires --generated. Train in generated rooms alone. Parents of targets and the class graph
     are those of the training rooms in any case."""
+    pool_rooms: int = 1500
+    """Variants and generated rooms in memory at once. If there are more, pools of about as many
+    take turns, and the next is built or loaded meanwhile."""
+    pool_updates: int = 200
+    """Updates in a pool before the next one's turn, rounded to whole calls of --chunk-updates."""
     chunk_updates: int = 10
     """Updates per compiled call; progress is reported after each call."""
     checkpoint_minutes: float = 2.0
@@ -397,7 +402,8 @@ def find_word_vectors(
 _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     (
         (
-            "steps", "episodes", "minutes", "chunk_updates", "checkpoint_minutes", "max_skipped",
+            "steps", "episodes", "minutes", "pool_rooms", "pool_updates", "chunk_updates",
+            "checkpoint_minutes", "max_skipped",
             "num_envs", "rollout_steps", "step_limit", "learning_rate", "adam_epsilon",
             "max_grad_norm", "width", "hidden", "word_norm", "inner_rate",
         ),
@@ -418,7 +424,10 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
         "be at most 1e15",
     ),
     (
-        ("num_envs", "rollout_steps", "step_limit", "chunk_updates", "history"),
+        (
+            "num_envs", "rollout_steps", "step_limit", "pool_rooms", "pool_updates",
+            "chunk_updates", "history",
+        ),
         lambda value: value <= 1_000_000,
         "be at most 1,000,000",
     ),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -25,9 +27,10 @@ from tdanet_jax.models.classes import ClassVocabulary, make_vocabulary
 from tdanet_jax.models.factory import make_model, resolve_precision
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.poses import PoseGrid
-from tdanet_jax.scenes import generated, tabulation, variants
+from tdanet_jax.scenes import generated, pools, tabulation, variants
 from tdanet_jax.scenes.dataset import Extras, Rooms, assign_rooms, find_targets, load_rooms
 from tdanet_jax.scenes.offline.features import features_path, load_features
+from tdanet_jax.scenes.pools import Part
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.scenes.target_distances import with_targets
@@ -52,7 +55,10 @@ class Task:
       vectors: the table of word vectors that they are from.
       extras: what came with imported rooms; None with the bundled ones.
       variants_version: hash of the tables of the variants and generated rooms among the training
-        rooms; None without.
+        rooms, of the first pool if there are several; None without.
+      further_pools: each gives the training rooms with a further pool of variants and generated
+        rooms in place of the first, if they are too many to be held at once. It is told (rooms
+        done, rooms of the pool) while any are built.
     """
 
     tables: SceneTables
@@ -66,6 +72,7 @@ class Task:
     vectors: WordVectors
     extras: Extras | None = None
     variants_version: str | None = None
+    further_pools: tuple[Callable[[Progress], EnvParams], ...] = ()
 
     @property
     def spec(self) -> ObservationSpec:
@@ -168,13 +175,17 @@ def task_in(rooms: Rooms, config: TrainConfig, progress: Progress | None = None)
     if rooms.path is not None and config.network.image == "features":
         features = load_features(rooms.path, rooms.tables)
     try:
-        added: list[SceneTables] = []
+        added: list[Part] = []
         for kind, count in ((variants, config.variants), (generated, config.generated)):
             if count:
                 names = _split(config, rooms)[1].train_scenes
-                added.append(kind.load(rooms, names, count, progress))
-        varied = tabulation.join(added, rooms.tables.classes) if added else None
-        return make_task(config, rooms.tables, vectors, rooms.extras, features, varied)
+                added += kind.parts(rooms, names, count)
+        dealt = [
+            functools.partial(pools.load, pool, rooms.tables.classes)
+            for pool in pools.deal(added, config.pool_rooms)
+        ]
+        varied = dealt[0](progress) if dealt else None
+        return make_task(config, rooms.tables, vectors, rooms.extras, features, varied, dealt[1:])
     except ValueError as error:
         if rooms.path is None:
             raise
@@ -188,6 +199,7 @@ def make_task(
     extras: Extras | None = None,
     features: np.ndarray | None = None,
     varied: SceneTables | None = None,
+    further_pools: Sequence[Callable[[Progress], SceneTables]] = (),
 ) -> Task:
     """The task of a configuration in the given rooms; the split is limited to what they hold.
 
@@ -201,6 +213,7 @@ def make_task(
         Images show hidden classes as well: nothing can be filtered out of them.
       varied: variants of the training rooms and generated ones, to train in as well, or with
         `generated_only` alone. Parents and class graph are those of the training rooms themselves.
+      further_pools: each gives further such rooms, which take turns with `varied`.
 
     Raises:
       ValueError: there are no rooms to train or to evaluate in, a target has no word vector, or the
@@ -224,34 +237,21 @@ def make_task(
             flag = "--variants" if config.variants else "--generated"
             raise ValueError(f"{flag}: there are no feature maps of these rooms")
         varied = with_targets(varied, tables.targets)
-        hidden = zero_shot.hide_classes(varied, {*split.hidden, *unnamed})
-        own = [] if config.generated_only else [seen_rooms]
-        seen_rooms = tabulation.join([*own, hidden], tables.classes)
     train_maps, eval_maps = _feature_maps(config.model, model, features, trains, tables.grid)
-    rewarded = config.learner.partial_reward
-    similarity = None
-    if rewarded == "similarity":
-        similarity = reward.greatest_similarity(seen_rooms, reward.cosines(train_words))
+    hidden = frozenset((*split.hidden, *unnamed))
+    trained = _TrainingRooms(
+        config, seen_rooms, split, hidden, model.spec, parents, train_words, train_maps
+    )
+
+    def further(load: Callable[[Progress], SceneTables]) -> Callable[[Progress], EnvParams]:
+        return lambda progress: trained.params(with_targets(load(progress), tables.targets))
+
     return Task(
         tables=tables,
         split=split,
         classes=classes,
         model=model,
-        train_params=with_noise(
-            make_params(
-                seen_rooms,
-                split.seen,
-                parents if rewarded == "parents" else reward.no_parents(seen_rooms),
-                [config.learner.step_limit] * len(tables.room_types),
-                model.spec,
-                similarity=similarity,
-                features=train_maps,
-                size_noise=config.learner.size_noise,
-            ),
-            seen_rooms,
-            sense_noise.parse(config.learner.noise),
-            train_words,
-        ),
+        train_params=trained.params(varied),
         eval_params=make_params(
             tables,
             {room: split.seen[room] + split.unseen[room] for room in split.seen},
@@ -266,7 +266,44 @@ def make_task(
         vectors=vectors,
         extras=extras,
         variants_version=None if varied is None else varied.data_version,
+        further_pools=tuple(further(load) for load in further_pools),
     )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _TrainingRooms:
+    """What the environment that a run trains in is made of, but for the rooms that are added."""
+
+    config: TrainConfig
+    rooms: SceneTables  # without hidden classes
+    split: Split
+    hidden: frozenset[str]  # classes to hide in added rooms
+    spec: ObservationSpec
+    parents: Parents
+    words: np.ndarray  # [C, D], zero for hidden classes
+    maps: FeatureMaps | None
+
+    def params(self, added: SceneTables | None) -> EnvParams:
+        """The environment in these rooms and added ones, or in the added ones alone."""
+        config, rooms, parents = self.config.learner, self.rooms, self.parents
+        if added is not None:
+            own = [] if self.config.generated_only else [rooms]
+            added = zero_shot.hide_classes(added, self.hidden)
+            rooms = tabulation.join([*own, added], rooms.classes)
+        similarity = None
+        if config.partial_reward == "similarity":
+            similarity = reward.greatest_similarity(rooms, reward.cosines(self.words))
+        params = make_params(
+            rooms,
+            self.split.seen,
+            parents if config.partial_reward == "parents" else reward.no_parents(rooms),
+            [config.step_limit] * len(rooms.room_types),
+            self.spec,
+            similarity=similarity,
+            features=self.maps,
+            size_noise=config.size_noise,
+        )
+        return with_noise(params, rooms, sense_noise.parse(config.noise), self.words)
 
 
 def _without_words(tables: SceneTables, split: Split, vectors: WordVectors) -> list[str]:

@@ -72,6 +72,35 @@ class EnvParams(struct.PyTreeNode):
             max_detections=rows,
         )
 
+    def padded(self, other: EnvParams, spare: float = 0.0) -> EnvParams:
+        """The same, with tables at least as long as those of `other`, so that one program serves
+        both; nothing reads the padding.
+
+        Args:
+          spare: of what has to be longer, as a share of its length, so that it need not be again.
+        """
+        rows = max(self.max_detections, other.max_detections)
+        params = self if rows == self.max_detections else self.with_rows(rows)
+
+        def longer(ours: jax.Array | None, theirs: jax.Array | None) -> jax.Array | None:
+            if ours is None or theirs is None:
+                return ours
+            length = max(int(len(ours) * (1 + spare)), len(theirs))
+            return jnp.pad(ours, ((0, length - len(ours)), *[(0, 0)] * (ours.ndim - 1)))
+
+        noise = params.noise
+        if noise is not None and other.noise is not None:
+            noise = noise.replace(corners=longer(noise.corners, other.noise.corners))
+        tables = {name: longer(getattr(params, name), getattr(other, name)) for name in _TABLES}
+        return params.replace(noise=noise, **tables)
+
+
+#: Tables whose length depends on the rooms.
+_TABLES = (
+    "next_position", "position_room", "row_start", "row_class", "row_box", "visible", "distance",
+    "scene_pairs", "pair_target", "pair_starts", "start_position", "similarity", "raster",
+)  # fmt: skip
+
 
 class EnvState(struct.PyTreeNode):
     """One episode in progress."""

@@ -16,6 +16,7 @@ from tdanet_jax.scenes import cache, tabulation, variants
 from tdanet_jax.scenes.dataset import Extras, Rooms
 from tdanet_jax.scenes.generation import catalogue
 from tdanet_jax.scenes.generation.rooms import Generator
+from tdanet_jax.scenes.pools import Part
 from tdanet_jax.scenes.records import of_scenes
 from tdanet_jax.scenes.scene import Scene, SceneError
 from tdanet_jax.scenes.tables import SceneTables
@@ -23,7 +24,7 @@ from tdanet_jax.scenes.tabulation import Progress
 
 #: The seed of the rooms in training: the same for all seeds of a run, which thus share them.
 SEED = 0
-CHUNK = 100  # rooms in a file of the cache
+CHUNK = 100  # rooms in a part, a file of the cache
 
 _MODULES = (
     "scenes.reachable",
@@ -66,33 +67,29 @@ def make(
     return Rooms(tables, extras, records=of_scenes(scenes))
 
 
-def load(
-    rooms: Rooms, known: Sequence[str], count: int, progress: Progress | None = None
-) -> SceneTables:
-    """The tables of generated rooms 1 to `count`, from the cache or built.
+def parts(rooms: Rooms, known: Sequence[str], count: int) -> list[Part]:
+    """Generated rooms 1 to `count`, a hundred to a part.
 
     Args:
       known: the training rooms that they are like.
-      progress: called with (rooms done, rooms in all) while any are built.
 
     Raises:
-      SceneError: as for `make`.
+      SceneError: when a part is built, as for `make`.
     """
     key = source(rooms, known)
-    parts = []
-    for first in range(1, count + 1, CHUNK):
-        numbers = range(first, min(first + CHUNK, count + 1))
 
-        def report(done: float, _: int, before: int = first - 1) -> None:
-            if progress is not None:
-                progress(before + done, count)
+    def part(numbers: range) -> Part:
+        def load(progress: Progress) -> SceneTables:
+            def build() -> SceneTables:
+                return _build(rooms, known, numbers, SEED, progress)[1]
 
-        def build(numbers: range = numbers) -> SceneTables:
-            return _build(rooms, known, numbers, SEED, report)[1]
+            name = f"{cache.GENERATED}{key}-{numbers[0]}-{numbers[-1]}"
+            return cache.load_or_build(name, build)
 
-        name = f"{cache.GENERATED}{key}-{numbers[0]}-{numbers[-1]}"
-        parts.append(cache.load_or_build(name, build))
-    return tabulation.join(parts, rooms.tables.classes)
+        return Part(len(numbers), load)
+
+    firsts = range(1, count + 1, CHUNK)
+    return [part(range(first, min(first + CHUNK, count + 1))) for first in firsts]
 
 
 def _build(

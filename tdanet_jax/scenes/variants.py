@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Sequence
@@ -11,7 +12,8 @@ from tdanet_jax.io import assets
 from tdanet_jax.scenes import cache, ithor, tabulation
 from tdanet_jax.scenes.checks import survey
 from tdanet_jax.scenes.dataset import Extras, Rooms
-from tdanet_jax.scenes.placement import statistics
+from tdanet_jax.scenes.placement import Statistics, statistics
+from tdanet_jax.scenes.pools import Part
 from tdanet_jax.scenes.records import of_scenes
 from tdanet_jax.scenes.scene import Scene
 from tdanet_jax.scenes.tables import SceneTables
@@ -98,36 +100,33 @@ def make(
     return Rooms(tables, extras, records=of_scenes(varied))
 
 
-def load(
-    rooms: Rooms, names: Sequence[str], copies: int, progress: Progress | None = None
-) -> SceneTables:
-    """The tables of variants 1 to `copies` of some training rooms, from the cache or built.
+def parts(rooms: Rooms, names: Sequence[str], copies: int) -> list[Part]:
+    """Variants 1 to `copies` of some training rooms, a part for each number.
 
     Args:
       names: the rooms. Statistics come from them alone.
-      progress: called with (variants done, variants in all) while any are built.
 
     Raises:
-      SceneError: the rooms do not say what lies on what.
+      SceneError: when a part is built, if the rooms do not say what lies on what.
     """
     key = source(rooms, names)
-    scenes: list[Scene] = []
-    parts: list[SceneTables] = []
 
-    def build() -> SceneTables:
-        if not scenes:
-            scenes.extend(rooms.scenes(names))
-        known = statistics(scenes)
+    @functools.cache
+    def known() -> tuple[list[Scene], Statistics]:
+        scenes = rooms.scenes(names)
+        return scenes, statistics(scenes)
 
-        def report(done: float, total: int) -> None:
-            if progress is not None:
-                progress((copy - 1) * total + done, copies * total)
+    def part(copy: int) -> Part:
+        def load(progress: Progress) -> SceneTables:
+            def build() -> SceneTables:
+                progress(0.0, len(names))
+                scenes, usual = known()
+                varied = [vary(scene, usual, SEED, copy) for scene in scenes]
+                tables = rooms.tables
+                return tabulation.build(varied, tables.classes, tables.targets, progress=progress)
 
-        report(0.0, len(scenes))
-        varied = [vary(scene, known, SEED, copy) for scene in scenes]
-        tables = rooms.tables
-        return tabulation.build(varied, tables.classes, tables.targets, progress=report)
+            return cache.load_or_build(f"{cache.VARIANTS}{key}-{copy}", build)
 
-    for copy in range(1, copies + 1):
-        parts.append(cache.load_or_build(f"{cache.VARIANTS}{key}-{copy}", build))
-    return tabulation.join(parts, rooms.tables.classes)
+        return Part(len(names), load)
+
+    return [part(copy) for copy in range(1, copies + 1)]

@@ -81,7 +81,7 @@ class NoiseParams(struct.PyTreeNode):
     corners: jax.Array  # [N + K, 4] float32, x1, y1, x2, y2 of each detection's extent
     known: jax.Array  # [A] int32, ascending: the classes that are detected anywhere
     similar: jax.Array  # [C, SIMILAR] int32, what a class is confused with
-    rows: int = struct.field(pytree_node=False)  # N, detections in the tables
+    rows: jax.Array  # [] int32, N, detections in the tables
     one_per_class: bool = struct.field(pytree_node=False)  # frames have one row per class
 
 
@@ -121,7 +121,7 @@ def make_params(
         corners=jnp.asarray(np.pad(corners.astype(np.float32), ((0, padding), (0, 0)))),
         known=jnp.asarray(known, jnp.int32),
         similar=jnp.asarray(_similar_classes(words, names, known), jnp.int32),
-        rows=len(classes),
+        rows=jnp.int32(len(classes)),
         one_per_class=one_per_class,
     )
 
@@ -309,10 +309,10 @@ def _index(bits: jax.Array, count: jax.Array) -> jax.Array:
     return (bits.astype(jnp.int32) * count) >> 16
 
 
-def _wide_index(high: jax.Array, low: jax.Array, count: int) -> jax.Array:
+def _wide_index(high: jax.Array, low: jax.Array, count: jax.Array) -> jax.Array:
     """From 32 bits, a whole number from 0 below `count`, all but equally likely."""
     share = high.astype(jnp.float32) * 2.0**-16 + low.astype(jnp.float32) * 2.0**-32
-    return jnp.clip((share * count).astype(jnp.int32), 0, max(count - 1, 0))
+    return jnp.clip((share * count).astype(jnp.int32), 0, jnp.maximum(count - 1, 0))
 
 
 def _normal(bits: jax.Array) -> jax.Array:

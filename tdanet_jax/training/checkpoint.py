@@ -39,6 +39,8 @@ ARRAYS = "state.npz"
 META = "meta.json"
 CHECKSUMS = "SHA256SUMS"
 KEPT = 2
+#: Rows of a frame.
+MOST_DETECTIONS = 2**15
 
 
 class NewerFormat(ValueError):
@@ -107,17 +109,27 @@ class Checkpoints:
         """The number of updates of the newest complete checkpoint."""
         return next(iter(self._steps()), None)
 
-    def restore(self, make_state: Callable[[], TrainState]) -> tuple[TrainState, dict[str, Any]]:
+    def restore(
+        self, make_state: Callable[[int | None], TrainState]
+    ) -> tuple[TrainState, dict[str, Any]]:
         """The newest checkpoint that can be read; a damaged one is skipped with a warning.
 
         Args:
-          make_state: makes a state of the right shapes; only traced, never run.
+          make_state: makes a state of the right shapes, given the `max_detections` of its meta, if
+            there are any; only traced, never run.
 
         Raises:
           ValueError: there is no checkpoint, or none that fits this configuration.
         """
-        blank = jax.eval_shape(_plain, jax.eval_shape(make_state))
-        state, meta = self._read(lambda path, written, meta: (_state(path, written, blank), meta))
+
+        def read(path: Path, written: int, meta: dict[str, Any]) -> tuple[TrainState, Any]:
+            rows = meta.get("max_detections")
+            if rows is not None:
+                rows = int(jsons.number(path, rows, "max_detections", MOST_DETECTIONS))
+            blank = jax.eval_shape(_plain, jax.eval_shape(lambda: make_state(rows)))
+            return _state(path, written, blank), meta
+
+        state, meta = self._read(read)
         return state.replace(key=jax.random.wrap_key_data(state.key)), meta
 
     def snapshot(self) -> Snapshot:

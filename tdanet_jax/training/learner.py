@@ -102,6 +102,20 @@ def init(
     )
 
 
+def begin_again(
+    state: TrainState, config: LearnerConfig, model: ActorCritic, params: EnvParams
+) -> TrainState:
+    """The run with new episodes in place of those in progress, in other rooms."""
+    # Updates fold their numbers into the key; these are 2^31 above the number of the next one.
+    key = jax.random.fold_in(state.key, jnp.uint32(2**31) + state.updates.astype(jnp.uint32))
+    batch = config.num_envs
+    return state.replace(
+        env_state=_reset(key, params, batch),
+        bootstrap_only=jnp.zeros(batch, bool),
+        recurrent=actor_critic.initial_state(model, state.params, batch, training=True),
+    )
+
+
 @jax.named_scope("environment")
 def _reset(key: jax.Array, params: EnvParams, batch: int) -> EnvState:
     return jax.vmap(dynamics.reset_state, (0, None))(jax.random.split(key, batch), params)

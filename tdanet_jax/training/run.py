@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from tdanet_jax.training import devices, history, learner
 from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.training.journal import METRICS_FILE, Journal, Row
 from tdanet_jax.training.learner import TrainState
+from tdanet_jax.training.pools import Pools
 
 
 class Run:
@@ -46,9 +48,10 @@ class Run:
         self.seconds = 0.0
         self.mesh = mesh or devices.first()
         self._shared = devices.everywhere(self.mesh)
-        self._words, self._params = jax.device_put(
-            (task.train_words, task.train_params), self._shared
-        )
+        self._words = jax.device_put(task.train_words, self._shared)
+        self._pools = Pools(task, config)
+        self._turn = 0  # of the pool whose rooms `state` is in
+        self._params = jax.device_put(self._pools.params(0), self._shared)
         shapes = jax.eval_shape(self._init, jax.random.key(0), self._words, self._params)
         self._layout = devices.layout(shapes, self.mesh)
         self.checkpoints = Checkpoints(folder)
@@ -73,8 +76,9 @@ class Run:
         return init(jax.random.key(self.config.seed), self._words, self._params)
 
     def _restore(self) -> TrainState:
-        def make_state() -> TrainState:
-            return self._init(jax.random.key(0), self._words, self._params)
+        def make_state(rows: int | None) -> TrainState:
+            more = max(rows or 0, self._params.max_detections)
+            return self._init(jax.random.key(0), self._words, self._params.with_rows(more))
 
         state, meta = self.checkpoints.restore(make_state)
         if meta["data_version"] != self.task.tables.data_version:
@@ -89,7 +93,19 @@ class Run:
             )
         self.seconds = float(meta["seconds"])
         self._saved = int(state.updates)
+        self._turn = self._pools.turn(max(0, self._saved - self.config.chunk_updates))
+        if self._turn:
+            self._enter(self._pools.params(self._turn), meta.get("max_detections", 0))
         return jax.device_put(state, self._layout)
+
+    def _enter(self, params: EnvParams, rows: int = 0) -> None:
+        """Takes the rooms of a pool, with tables at least as long as those before.
+
+        Args:
+          rows: in a frame, at least.
+        """
+        params = params.with_rows(max(rows, params.max_detections)).padded(self._params)
+        self._params = jax.device_put(params, self._shared)
 
     def save(self) -> None:
         """Writes a checkpoint of the present state, unless there is one.
@@ -103,6 +119,8 @@ class Run:
                 "data_version": self.task.tables.data_version,
                 "variants": self.task.variants_version,
             }
+            if self.task.further_pools:
+                meta["max_detections"] = self._params.max_detections
             state = devices.whole(self.state, self.mesh)
             if devices.is_lead():
                 self.checkpoints.save(state, meta)
@@ -133,14 +151,58 @@ class Run:
         self._open_journal()
         if self._over(until):
             return
-        chunk = self._compile()
-        while not self._over(until):
-            before, shares, began = self.progress, self._shares(), time.perf_counter()
-            state, metrics = chunk(self.state, shares, self._words, self._params)
-            metrics = jax.device_get(metrics)
-            took = devices.from_lead(time.perf_counter() - began)
-            yield self._record(state, metrics, before, took)
-            self._check_finite()
+        chunk = None
+        try:
+            while not self._over(until):
+                changed = self._change_rooms()
+                chunk = self._compile() if chunk is None or changed else chunk
+                before, shares, began = self.progress, self._shares(), time.perf_counter()
+                state, metrics = chunk(self.state, shares, self._words, self._params)
+                metrics = jax.device_get(metrics)
+                took = devices.from_lead(time.perf_counter() - began)
+                yield self._record(state, metrics, before, took)
+                self._check_finite()
+        finally:
+            self._pools.close()
+
+    def waits_for_rooms(self, seconds: float) -> tuple[float, int] | None:
+        """Waits at most so long for the rooms of the next chunk, if they are others.
+
+        Returns:
+          (rooms done, rooms in all) while they are being built; None when they are there.
+        """
+        turn = self._pools.turn(int(self.state.updates))
+        if turn == self._turn or self.progress >= 1.0:
+            return None
+        return self._pools.waits(turn, seconds)
+
+    def _change_rooms(self) -> bool:
+        """Enters the rooms of the next chunk, if they are others; True if they are compiled anew.
+
+        Every episode that is in progress ends without a trace, and another begins.
+        """
+        turn, before = self._pools.turn(int(self.state.updates)), self._params
+        if turn != self._turn:
+            try:
+                self._enter(self._pools.params(turn))
+            except ValueError:
+                self.save()
+                raise
+            self._turn = turn
+            self._begin_again()
+        self._pools.prepare(turn + 1)
+        return _shapes(before) != _shapes(self._params)
+
+    def _follow(self, other: Run) -> None:
+        """Enters the rooms of another run of the same task."""
+        self._params, self._turn = other._params, other._turn
+        self._begin_again()
+
+    def _begin_again(self) -> None:
+        def again(state: TrainState, params: EnvParams) -> TrainState:
+            return learner.begin_again(state, self.config.learner, self.model, params)
+
+        self.state = jax.jit(again, out_shardings=self._layout)(self.state, self._params)
 
     def _over(self, until: int | None) -> bool:
         stopped = until is not None and int(self.state.updates) >= until
@@ -269,13 +331,22 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
     def apart(stacked: TrainState) -> list[TrainState]:
         return [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(len(runs))]
 
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(run.state for run in runs))
-    arguments = runs[0]._words, runs[0]._params
+    def together() -> TrainState:
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(run.state for run in runs))
+
+    lead, stacked, chunk = runs[0], together(), None  # rooms are the lead's
     for run in runs:
         run._open_journal()
-    chunk = several.lower(stacked, runs[0]._shares(), *arguments).compile()
-    while runs[0].progress < 1.0:
-        before, shares, began = runs[0].progress, runs[0]._shares(), time.perf_counter()
+    while lead.progress < 1.0:
+        turn, changed = lead._turn, lead._change_rooms()
+        if lead._turn != turn:
+            for run in runs[1:]:
+                run._follow(lead)
+            stacked = together()
+        arguments = lead._words, lead._params
+        if chunk is None or changed:
+            chunk = several.lower(stacked, lead._shares(), *arguments).compile()
+        before, shares, began = lead.progress, lead._shares(), time.perf_counter()
         stacked, metrics = chunk(stacked, shares, *arguments)
         metrics = jax.device_get(metrics)
         took = time.perf_counter() - began
@@ -286,6 +357,11 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
         yield rows
         for run in runs:
             run._check_finite()
+
+
+def _shapes(params: EnvParams) -> tuple[Any, list[tuple[int, ...]]]:
+    """All that a program is compiled for."""
+    return jax.tree.structure(params), [leaf.shape for leaf in jax.tree.leaves(params)]
 
 
 _UPDATE_MEANS = (

@@ -27,6 +27,9 @@ from tdanet_jax.training.callbacks import Callbacks
 from tdanet_jax.training.journal import SINKS, Row, read_metrics
 from tdanet_jax.training.run import Run, chunks_together
 
+#: Between two looks at whether the next rooms are there.
+SECONDS_OF_WAITING = 1.0
+
 
 def train(
     config: TrainConfig | None,
@@ -199,13 +202,23 @@ def _learn(
             callbacks.on_rows(runs, rows)
             for sink in sinks:
                 sink(rows[0])
-            if devices.anywhere(callbacks.should_stop()):
+            if _stopped(runs[0], callbacks):
                 callbacks.on_stop()
                 save()
                 return False
             if runs[0].seconds - saved > 60 * runs[0].config.checkpoint_minutes:
                 saved = save()
         save()
+    return True
+
+
+def _stopped(run: Run, callbacks: Callbacks) -> bool:
+    """Whether a process stops the run; waits until the rooms of its next chunk are there."""
+    while not devices.anywhere(callbacks.should_stop()):
+        waits = run.waits_for_rooms(SECONDS_OF_WAITING)
+        if not devices.anywhere(waits is not None):
+            return False
+        callbacks.on_rooms(*waits or (1.0, 1))
     return True
 
 

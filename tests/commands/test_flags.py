@@ -596,6 +596,8 @@ SHOWN = {
     "as_ever",
     "generated_only": "scenes/test_generated.py::test_a_run_trains_in_generated_rooms_and_is_"
     "evaluated_as_ever",
+    "pool_rooms": "scenes/test_generated.py::test_rooms_that_are_too_many_are_dealt_to_pools",
+    "pool_updates": "training/test_pools.py::test_turns_are_whole_chunks_and_one_pool_has_no_turns",
     "minutes": "training/test_run_bookkeeping.py::test_time_and_rows_continue",
     "seed": "training/test_run.py::test_another_seed_gives_another_run",
     "validation": "test_splits.py::test_validation_touches_neither_test_rooms_nor_unseen_classes",
@@ -713,6 +715,7 @@ def test_checkpoints_are_written_at_their_interval(minutes: float, saves: int) -
     """In five minutes, after whose first and last moment there is one anyway."""
     config = TrainConfig(checkpoint_minutes=minutes)
     run = SimpleNamespace(seconds=0.0, config=config, saved=[])
+    run.waits_for_rooms = lambda seconds: None
     run.save = lambda: run.saved.append(run.seconds)
 
     def chunks() -> Iterator[list[dict[str, Any]]]:

@@ -11,11 +11,13 @@ import pytest
 
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.poses import PoseGrid
-from tdanet_jax.scenes import SceneTables, cache, dataset, generated
+from tdanet_jax.scenes import SceneTables, cache, dataset, generated, pools
 from tdanet_jax.scenes import ithor as bundled
 from tdanet_jax.scenes.dataset import Extras, Rooms
+from tdanet_jax.scenes.pools import Part
 from tdanet_jax.scenes.records import of_scenes
 from tdanet_jax.scenes.scene import Scene, SceneError
+from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.task import task_in
 from tests.support import toy
 
@@ -73,17 +75,21 @@ def test_rooms_are_built_once_in_chunks_whatever_their_number(
     monkeypatch.setattr(generated, "Generator", Recorder)
     monkeypatch.setattr(generated, "CHUNK", 2)
     told: list[tuple[float, int]] = []
-    tables = generated.load(rooms, KNOWN, 3, lambda done, total: told.append((done, total)))
+
+    def load(known: tuple[str, ...], count: int, progress: Progress | None = None) -> SceneTables:
+        return pools.load(generated.parts(rooms, known, count), rooms.tables.classes, progress)
+
+    tables = load(KNOWN, 3, lambda done, total: told.append((done, total)))
     assert sorted(made) == [1, 2, 3]
     assert tables.scenes == ("Room1", "Room2", "Room3")
     assert tables.classes == rooms.tables.classes
     assert told == [(1, 3), (2, 3), (3, 3)]
     assert len([*folder.glob("generated-*.npz")]) == 2
-    again = generated.load(rooms, KNOWN, 3)
+    again = load(KNOWN, 3)
     assert again.data_version == tables.data_version
-    generated.load(rooms, KNOWN, 4)
+    load(KNOWN, 4)
     assert sorted(made) == [1, 2, 3, 3, 4]  # the first chunk is known
-    generated.load(rooms, KNOWN[:-1], 2)
+    load(KNOWN[:-1], 2)
     assert len(made) == 7
 
 
@@ -113,11 +119,12 @@ def test_a_run_trains_in_generated_rooms_and_is_evaluated_as_ever(
     asked: list[tuple[tuple[str, ...], int]] = []
     made = rooms.tables.subset(["FloorPlan9", "FloorPlan309"])
 
-    def load(_: Rooms, known: tuple[str, ...], count: int, __: object) -> SceneTables:
+    def parts(_: Rooms, known: tuple[str, ...], count: int) -> list[Part]:
         asked.append((known, count))
-        return dataclasses.replace(made, scenes=("kitchen-0001", "bedroom-0001"))
+        named = dataclasses.replace(made, scenes=("kitchen-0001", "bedroom-0001"))
+        return [Part(2, lambda _: named)]
 
-    monkeypatch.setattr(generated, "load", load)
+    monkeypatch.setattr(generated, "parts", parts)
     config = TrainConfig(network=SMALL, validation=True, generated=2, generated_only=alone)
     task = task_in(rooms, config)
     # Like the rooms that validation trains in, and no others.
@@ -129,3 +136,33 @@ def test_a_run_trains_in_generated_rooms_and_is_evaluated_as_ever(
     assert plain.variants_version is None
     both = len(plain.train_params.next_position) + len(made.position)
     assert len(task.train_params.next_position) == (len(made.position) if alone else both)
+
+
+def test_rooms_that_are_too_many_are_dealt_to_pools(
+    rooms: Rooms, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four parts of a room each: two pools of two, of which one is loaded at the start."""
+    loaded: list[str] = []
+
+    def part(name: str) -> Part:
+        def load(_: Progress) -> SceneTables:
+            loaded.append(name)
+            return dataclasses.replace(rooms.tables.subset([name]), scenes=(f"{name}-v01",))
+
+        return Part(1, load)
+
+    monkeypatch.setattr(generated, "parts", lambda *_: [part(name) for name in KNOWN[::2]])
+    config = TrainConfig(
+        network=SMALL, validation=True, generated=4, generated_only=True, pool_rooms=3
+    )
+    task = task_in(rooms, config)
+    assert loaded == [KNOWN[0], KNOWN[4]]
+    assert len(task.further_pools) == 1
+    points = len(rooms.tables.subset([KNOWN[0], KNOWN[4]]).position)
+    assert len(task.train_params.next_position) == points
+    further = task.further_pools[0](lambda done, total: None)
+    assert loaded == list(KNOWN[::4]) + list(KNOWN[2::4])
+    assert len(further.next_position) == len(rooms.tables.subset([KNOWN[2], KNOWN[6]]).position)
+    whole = task_in(rooms, dataclasses.replace(config, pool_rooms=4))
+    assert whole.further_pools == ()
+    assert whole.variants_version != task.variants_version

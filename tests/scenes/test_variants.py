@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from tdanet_jax.config import NetworkConfig, TrainConfig
-from tdanet_jax.scenes import SceneTables, cache, dataset, ithor, tabulation, variants
+from tdanet_jax.scenes import SceneTables, cache, dataset, ithor, pools, tabulation, variants
 from tdanet_jax.scenes.checks import survey
 from tdanet_jax.scenes.dataset import Extras, Rooms
+from tdanet_jax.scenes.pools import Part
 from tdanet_jax.scenes.records import of_scenes
 from tdanet_jax.scenes.scene import Scene, SceneObject
+from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.task import task_in
 
 #: A training room, one that validation evaluates in, and a test room, of three types.
@@ -43,11 +45,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 TRAIN = ("FloorPlan15", "FloorPlan313", "FloorPlan416")
 
 
+def load(rooms: Rooms, copies: int, progress: Progress | None = None) -> SceneTables:
+    return pools.load(variants.parts(rooms, TRAIN, copies), rooms.tables.classes, progress)
+
+
 def test_variants_are_built_once(
     rooms: Rooms, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[tuple[float, int]] = []
-    first = variants.load(rooms, TRAIN, 2, lambda done, total: told.append((done, total)))
+    first = load(rooms, 2, lambda done, total: told.append((done, total)))
     assert first.scenes == tuple(f"{name}-v{i:02d}" for i in (1, 2) for name in TRAIN)
     assert first.classes == rooms.tables.classes
     assert first.targets == rooms.tables.targets
@@ -60,10 +66,10 @@ def test_variants_are_built_once(
         raise AssertionError("built although cached")
 
     monkeypatch.setattr(tabulation, "build", build)
-    again = variants.load(rooms, TRAIN, 2)
+    again = load(rooms, 2)
     assert again.data_version == first.data_version
     # Fewer of them are the first of these.
-    one = variants.load(rooms, TRAIN, 1)
+    one = load(rooms, 1)
     assert one.data_version == first.subset(one.scenes).data_version
 
 
@@ -141,13 +147,13 @@ def test_nothing_of_the_rooms_of_the_evaluation_is_in_variants(
     """Perturb all of these rooms and see nothing change; of a training room, it is noticed."""
     config = TrainConfig(validation=validation, variants=1, network=SMALL)
     asked: list[tuple[str, ...]] = []
-    load = variants.load
+    parts = variants.parts
 
-    def noted(given: Rooms, names: tuple[str, ...], *rest: object) -> SceneTables:
+    def noted(given: Rooms, names: tuple[str, ...], copies: int) -> list[Part]:
         asked.append(tuple(names))
-        return load(given, names, *rest)  # type: ignore[arg-type]
+        return parts(given, names, copies)
 
-    monkeypatch.setattr(variants, "load", noted)
+    monkeypatch.setattr(variants, "parts", noted)
     version = task_in(rooms, config).variants_version
     train = set(asked[0])
     assert train == {*TRAIN} if validation else train == {*TRAIN, "FloorPlan18", "FloorPlan317",

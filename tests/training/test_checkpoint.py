@@ -43,7 +43,7 @@ PARAMS: EnvParams = params_of(TABLES)
 WORDS = jnp.asarray(np.random.default_rng(0).normal(size=(len(TABLES.classes), 5)), jnp.float32)
 
 
-def make_state() -> TrainState:
+def make_state(rows: int | None = None) -> TrainState:
     return init(jax.random.key(3), LearnerConfig(num_envs=4), MODEL, WORDS, PARAMS)
 
 
@@ -216,7 +216,7 @@ def test_a_checkpoint_of_another_network_is_refused(saved: Checkpoints) -> None:
     wider = network(9)
     config = dataclasses.replace(LearnerConfig(), num_envs=4)
     with pytest.raises(ValueError, match="unreadable checkpoint"):
-        saved.restore(lambda: init(jax.random.key(0), config, wider, WORDS, PARAMS))
+        saved.restore(lambda rows: init(jax.random.key(0), config, wider, WORDS, PARAMS))
 
 
 @pytest.fixture
@@ -245,7 +245,7 @@ def test_the_shapes_of_another_network_are_seen_before_any_array_is_read(
 ) -> None:
     config = LearnerConfig(num_envs=4)
     with pytest.raises(ValueError, match=r"unreadable checkpoint \(.* is float32\(.*, not"):
-        saved.restore(lambda: init(jax.random.key(0), config, network(9), WORDS, PARAMS))
+        saved.restore(lambda rows: init(jax.random.key(0), config, network(9), WORDS, PARAMS))
 
 
 def test_a_run_may_go_on_with_more_than_a_stranger_may_send(
@@ -263,7 +263,7 @@ def test_every_type_of_a_state_comes_back_and_others_are_refused(tmp_path: Path)
     state = after(1).replace(recurrent=odd)
     meta = {"seconds": 0.5, "data_version": "d"}
     checkpoints.save(state, meta)
-    again, _ = checkpoints.restore(lambda: make_state().replace(recurrent=odd))
+    again, _ = checkpoints.restore(lambda rows: make_state().replace(recurrent=odd))
     chex.assert_trees_all_equal(plain(again), plain(state))
     chex.assert_trees_all_equal_shapes_and_dtypes(plain(again), plain(state))
     half = after(2).replace(recurrent={"carry": jnp.ones(3, jnp.bfloat16)})
@@ -292,3 +292,12 @@ def test_odd_progress_is_one_clear_line(tmp_path: Path, meta: dict) -> None:
         with pytest.raises(ValueError, match=odd) as caught:
             read()
         assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("rows", [2**15 + 1, "many", True])
+def test_rows_that_cannot_be_are_refused(tmp_path: Path, rows: object) -> None:
+    checkpoints = Checkpoints(tmp_path)
+    meta = {"seconds": 1.0, "data_version": "d", "max_detections": rows}
+    checkpoints.save(after(1), meta)
+    with pytest.raises(ValueError, match=r"unreadable checkpoint .*max_detections"):
+        checkpoints.restore(make_state)

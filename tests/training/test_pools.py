@@ -1,0 +1,334 @@
+"""Rooms that take turns in training: whose turn it is, one program, and going on bit for bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import chex
+import jax
+import numpy as np
+import pytest
+
+from tdanet_jax import config as configs
+from tdanet_jax import words
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.env import dynamics
+from tdanet_jax.evaluation import episodes
+from tdanet_jax.scenes import SceneTables
+from tdanet_jax.scenes.scene import SceneError
+from tdanet_jax.scenes.tabulation import Progress
+from tdanet_jax.task import Task, make_task
+from tdanet_jax.training import learner, pools
+from tdanet_jax.training.callbacks import Callbacks
+from tdanet_jax.training.journal import read_metrics
+from tdanet_jax.training.pools import Pools
+from tdanet_jax.training.run import Run, chunks_together
+from tdanet_jax.workflows import train as workflow
+
+#: Eight chunks of two updates of 8 x 5 steps; the rooms change after every two of them.
+TINY = TrainConfig(
+    steps=640,
+    history=0,
+    chunk_updates=2,
+    pool_updates=4,
+    generated=3,
+    generated_only=True,
+    learner=LearnerConfig(num_envs=8, rollout_steps=5, step_limit=6, noise="mix"),
+    network=NetworkConfig(width=16, hidden=16, odometry=True),
+)
+#: A kitchen, a living room and two bedrooms with ever more in view, and one program for all of
+#: them but for what a later one lacks room for.
+ROOMS = (("FloorPlan1", "FloorPlan2"), ("FloorPlan201",), ("FloorPlan301",))
+
+
+def named(tables: SceneTables) -> SceneTables:
+    return dataclasses.replace(tables, scenes=tuple(f"{name}-v01" for name in tables.scenes))
+
+
+def task_of(
+    ithor: SceneTables,
+    asked: list[int],
+    rooms: tuple[tuple[str, ...], ...] = ROOMS,
+    config: TrainConfig = TINY,
+) -> Task:
+    """A task whose pools are some of the bundled rooms; notes which of them are loaded."""
+    first, *others = (named(ithor.subset(names)) for names in rooms)
+
+    def further(number: int, tables: SceneTables, progress: Progress) -> SceneTables:
+        progress(0.0, 1)
+        asked.append(number)
+        return tables
+
+    loads = [
+        lambda progress, n=n, tables=tables: further(n, tables, progress)
+        for n, tables in enumerate(others, start=1)
+    ]
+    return make_task(config, ithor, words.load_bundled(), varied=first, further_pools=loads)
+
+
+@pytest.fixture(scope="module")
+def asked() -> list[int]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def task(ithor: SceneTables, asked: list[int]) -> Task:
+    return task_of(ithor, asked)
+
+
+@pytest.fixture(scope="module")
+def whole(
+    task: Task, asked: list[int], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Run, list[int], list[str], list[int]]:
+    """A run that nothing interrupted, its turns, the room types it was in, and what was loaded."""
+    run = Run(tmp_path_factory.mktemp("whole"), TINY, task)
+    turns, types = [], []
+    for _ in run.chunks():
+        turns.append(run._turn)
+        position = np.asarray(run.state.env_state.pose) // run._params.grid.views
+        types.append("".join(map(str, np.unique(run._params.position_room[position]))))
+    run.save()
+    return run, turns, types, [*asked]
+
+
+def leaves(run: Run) -> list[np.ndarray]:
+    plain = run.state.replace(key=jax.random.key_data(run.state.key))
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(plain)]
+
+
+def test_pools_take_turns_and_only_those_that_the_budget_reaches_are_loaded(
+    whole: tuple[Run, list[int], list[str], list[int]],
+) -> None:
+    _, turns, types, loaded = whole
+    assert turns == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert types == ["0", "0", "1", "1", "2", "2", "0", "0"]
+    assert loaded == [1, 2]
+
+
+@pytest.mark.parametrize("stop", [1, 2, 3, 4, 6])
+def test_a_run_goes_on_bit_for_bit_in_the_rooms_that_it_was_in(
+    whole: tuple[Run, list[int], list[str], list[int]], task: Task, tmp_path: Path, stop: int
+) -> None:
+    begun = Run(tmp_path, TINY, task)
+    for count, _ in enumerate(begun.chunks(), start=1):
+        if count == stop:
+            begun.save()
+        if count == min(stop + 2, 7):  # what comes after the checkpoint is lost
+            break
+    again = Run(tmp_path, TINY, task)
+    assert again.steps == 80 * stop
+    list(again.chunks())
+    for ours, theirs in zip(leaves(again), leaves(whole[0]), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_one_program_serves_pools_that_fit(
+    ithor: SceneTables, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bedroom with fewer detections fits the program of one with more, not the other way."""
+    large, small = "FloorPlan301", "FloorPlan302"
+    sizes = {name: len(ithor.subset([name]).row_object) for name in (large, small)}
+    if sizes[large] < sizes[small]:
+        large, small = small, large
+    config = dataclasses.replace(TINY, learner=dataclasses.replace(TINY.learner, noise="none"))
+    compiled: list[Run] = []
+    compile_ = Run._compile
+    monkeypatch.setattr(Run, "_compile", lambda run: (compiled.append(run), compile_(run))[1])
+    for rooms, programs in ((((large,), (small,)), 1), (((small,), (large,)), 2)):
+        compiled.clear()
+        run = Run(tmp_path / str(programs), config, task_of(ithor, [], rooms, config))
+        run.folder.mkdir()
+        list(run.chunks())
+        assert run._turn == 3
+        assert len(compiled) == programs
+
+
+def test_padding_changes_nothing(ithor: SceneTables) -> None:
+    """Episodes are the same with longer tables, and with noise that copies any detection."""
+    task = task_of(ithor, [])
+    plain = task.train_params
+    longer = plain.padded(task.eval_params.replace(noise=plain.noise)).padded(plain, spare=0.1)
+    assert len(longer.row_class) > 1.09 * len(task.eval_params.row_class)
+    assert longer.max_detections == task.eval_params.max_detections > plain.max_detections
+    assert len(longer.room_pool) == len(plain.room_pool)
+    longer = plain.padded(plain, spare=0.5)
+    assert longer.max_detections == plain.max_detections
+
+    def walk(params: object) -> list[np.ndarray]:
+        def step(state: object, key: jax.Array) -> tuple[object, object]:
+            action = jax.random.randint(key, (), 0, 6)
+            obs, state, *rest = dynamics.step(key, state, action, params)
+            return state, (obs, rest[:3])
+
+        _, state = dynamics.reset(jax.random.key(0), params)
+        _, seen = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 100))
+        return jax.tree.leaves(seen)
+
+    for ours, theirs in zip(jax.jit(walk)(plain), jax.jit(walk)(longer), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_nothing_hidden_is_in_further_pools(ithor: SceneTables) -> None:
+    task = task_of(ithor, [])
+    hidden = [ithor.classes.index(name) for name in task.split.hidden]
+    for load in task.further_pools:
+        params = load(lambda done, total: None)
+        assert not np.isin(np.asarray(params.row_class)[:-1], hidden).any()
+        assert params.noise is not None
+        assert not np.isin(np.asarray(params.noise.known), hidden).any()
+    # They are in these rooms.
+    rooms = ithor.subset([name for names in ROOMS[1:] for name in names])
+    assert np.isin(rooms.row_class, hidden).any()
+
+
+def failing(task: Task) -> Task:
+    def load(progress: Progress) -> None:
+        raise SceneError("no room to build")
+
+    return dataclasses.replace(task, further_pools=(load,))
+
+
+def test_a_pool_that_cannot_be_built_loses_nothing(task: Task, tmp_path: Path) -> None:
+    run = Run(tmp_path, TINY, failing(task))
+    with pytest.raises(SceneError, match="no room to build"):
+        list(run.chunks())
+    assert len(read_metrics(tmp_path)) == 2
+    assert run.checkpoints.latest() == 4
+
+
+@pytest.fixture
+def slow() -> Iterator[threading.Event]:
+    """Set when the rooms may be there."""
+    event = threading.Event()
+    yield event
+    event.set()
+
+
+def waiting(task: Task, event: threading.Event) -> Task:
+    def load(progress: Progress) -> object:
+        progress(3.0, 10)
+        while not event.wait(0.01):
+            progress(4.0, 10)
+        return task.train_params.padded(task.train_params, pools.SPARE)
+
+    return dataclasses.replace(task, further_pools=(load,))
+
+
+class Watching(Callbacks):
+    """Stops, or lets the rooms be there, when it has been told of them twice."""
+
+    def __init__(self, event: threading.Event, stop: bool) -> None:
+        self.event, self.stop = event, stop
+        self.told: list[tuple[float, int]] = []
+        self.stopped = False
+
+    def on_rooms(self, done: float, total: int) -> None:
+        self.told.append((done, total))
+        if len(self.told) == 2 and not self.stop:
+            self.event.set()
+
+    def should_stop(self) -> bool:
+        return self.stop and len(self.told) >= 2
+
+    def on_stop(self) -> None:
+        self.stopped = True
+
+
+@pytest.mark.parametrize("stop", [False, True])
+def test_a_run_that_waits_for_rooms_says_so_and_can_be_stopped(
+    task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow: threading.Event, stop: bool
+) -> None:
+    monkeypatch.setattr(workflow, "SECONDS_OF_WAITING", 0.02)
+    monkeypatch.setattr(workflow, "load_task", lambda *_: waiting(task, slow))
+    monkeypatch.setattr(workflow, "_report", lambda *_: {})
+    monkeypatch.setattr(episodes, "load", lambda *_: {})
+    watching = Watching(slow, stop)
+    workflow.train(TINY, tmp_path / "run", callbacks=watching)
+    assert len(watching.told) >= 2
+    assert {*watching.told} <= {(0.0, 1), (3.0, 10), (4.0, 10)}
+    assert watching.stopped == stop
+    assert len(read_metrics(tmp_path / "run")) == (2 if stop else 8)
+
+
+def test_what_is_loaded_in_the_background_stops_when_the_run_does(
+    task: Task, slow: threading.Event, tmp_path: Path
+) -> None:
+    run = Run(tmp_path, TINY, waiting(task, slow))
+    chunks = run.chunks()
+    next(chunks)
+    assert run._pools._loading is not None
+    thread = run._pools._loading._thread
+    assert thread.is_alive()
+    chunks.close()
+    thread.join(10)
+    assert not thread.is_alive()
+
+
+def test_turns_are_whole_chunks_and_one_pool_has_no_turns(task: Task) -> None:
+    config = dataclasses.replace(TINY, pool_updates=5, chunk_updates=2)
+    assert [Pools(task, config).turn(updates) for updates in (0, 2, 4, 6, 8)] == [0, 0, 1, 1, 2]
+    config = dataclasses.replace(TINY, pool_updates=1, chunk_updates=10)
+    assert [Pools(task, config).turn(updates) for updates in (0, 10, 20)] == [0, 1, 2]
+    alone = dataclasses.replace(task, further_pools=())
+    assert Pools(alone, TINY).turn(1000) == 0
+    assert Pools(alone, TINY).params(0) is task.train_params
+
+
+def test_keys_of_new_episodes_are_those_of_no_update(
+    whole: tuple[Run, list[int], list[str], list[int]],
+) -> None:
+    run = whole[0]
+    model, params = run.model, run._params
+    again = learner.begin_again(run.state, TINY.learner, model, params)
+    later = run.state.replace(updates=run.state.updates + 1)
+    other = learner.begin_again(later, TINY.learner, model, params)
+    assert not np.array_equal(again.env_state.pose, other.env_state.pose)
+    key = jax.random.fold_in(run.state.key, run.state.updates)
+    update = learner._reset(key, params, TINY.learner.num_envs)
+    assert not np.array_equal(again.env_state.pose, update.pose)
+    assert not again.bootstrap_only.any()
+    assert again.recurrent.is_first.all()
+
+
+@pytest.mark.slow
+def test_seeds_that_train_together_change_rooms_together(task: Task, tmp_path: Path) -> None:
+    runs = [
+        Run(tmp_path / str(seed), dataclasses.replace(TINY, seed=seed), task) for seed in (0, 1)
+    ]
+    for run in runs:
+        run.folder.mkdir()
+    turns = [[run._turn for run in runs] for _ in chunks_together(runs)]
+    assert turns == [[k // 2] * 2 for k in range(8)]
+    # Interrupted and continued, they end where they would have ended.
+    others = [
+        Run(tmp_path / f"b{seed}", dataclasses.replace(TINY, seed=seed), task) for seed in (0, 1)
+    ]
+    for run in others:
+        run.folder.mkdir()
+    for count, _ in enumerate(chunks_together(others), start=1):
+        if count == 4:
+            break
+    for run in others:
+        run.save()
+    others = [
+        Run(tmp_path / f"b{seed}", dataclasses.replace(TINY, seed=seed), task) for seed in (0, 1)
+    ]
+    list(chunks_together(others))
+    for ours, theirs in zip(runs, others, strict=True):
+        for one, other in zip(leaves(ours), leaves(theirs), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_flags_of_pools_must_be_positive() -> None:
+    for name in ("pool_rooms", "pool_updates"):
+        with pytest.raises(ValueError, match=f"--{name.replace('_', '-')} 0: must be positive"):
+            dataclasses.replace(configs.TrainConfig(), **{name: 0}).check()
+
+
+def test_a_further_pool_is_as_a_first_one_would_be(ithor: SceneTables, task: Task) -> None:
+    alone = task_of(ithor, [], ROOMS[1:2])
+    further = task.further_pools[0](lambda done, total: None)
+    chex.assert_trees_all_equal(further, alone.train_params)
