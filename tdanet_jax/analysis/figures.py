@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +93,44 @@ def training_curves(
     figure.legend(
         lines.values(), map(in_figure, lines), loc="outside lower center", ncols=2, frameon=False
     )
+    drawing.save(figure, path, DPI, comment)
+
+
+def room_curve(
+    points: Sequence[tuple[str, int, Mapping[str, Mapping[str, float]]]],
+    path: Path,
+    comment: str | None = None,
+) -> None:
+    """SR and SPL of seen and unseen targets against the number of training rooms.
+
+    Args:
+      points: of each run, the kind of its rooms, their number, and its results in percent by group
+        and measure. A kind's line goes through the means of runs in as many rooms.
+      path: the picture's file.
+      comment: unseen, in the file; it must be a PNG then.
+    """
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True, sharey="row")
+    kinds = [*dict.fromkeys(kind for kind, _, _ in points)]
+    for row, measure in zip(axes, MEASURES, strict=True):
+        for axis, group in zip(row, GROUPS, strict=True):
+            for index, kind in enumerate(kinds):
+                runs = [(count, found[group][measure]) for k, count, found in points if k == kind]
+                counts = sorted({count for count, _ in runs})
+                means = [np.mean([rate for n, rate in runs if n == count]) for count in counts]
+                color = PALETTE[index % len(PALETTE)]
+                axis.plot(counts, means, "-", color=color, linewidth=1)
+                axis.plot(*zip(*runs, strict=True), MARKERS[index], color=color, label=kind)
+            axis.set(xscale="log", ylabel=f"{group} targets, {measure}, per cent")
+            axis.grid(alpha=0.3)
+            axis.spines[["top", "right"]].set_visible(False)
+    ticks = sorted({count for _, count, _ in points})
+    for axis in axes[-1]:
+        axis.set(xlabel="training rooms")
+        axis.set_xticks(ticks, [f"{count:,}" for count in ticks], minor=False)
+        axis.set_xticks([], minor=True)
+    lines = axes[0][0].get_legend_handles_labels()
+    figure.legend(*lines, loc="outside lower center", ncols=2, frameon=False)
     drawing.save(figure, path, DPI, comment)
 
 

@@ -2,7 +2,8 @@
 
 A folder of `results/` is a row. It holds `results.json` and `episodes.jsonl`, what was reached;
 `run.json`, by which command and where; and, if something was trained, `config.json`, and
-`metrics.jsonl` if it is known how it learned.
+`metrics.jsonl` if it is known how it learned. Folders of `results/validation/` are runs with
+`--validation`, for choosing settings. They hold no episodes, and no test has seen them.
 """
 
 from __future__ import annotations
@@ -38,12 +39,16 @@ from tdanet_jax.workflows.evaluate import UNTRAINED
 
 #: Flags that do not tell agents apart here. The last two are what "auto" became on a machine.
 _SHARED = (*comparison.NOT_SETTINGS, "--split", "--model", "--precision", "--image")
+#: The folder in `results/` of runs with `--validation`; the names of their rows begin with it.
+VALIDATION = "validation/"
 #: The value of `model` in the `results.json` of a custom policy.
 CUSTOM = "custom"
 #: What can stand in a command that every shell takes as it is, besides letters and digits.
 _PLAIN = r"[\w @%+=:,./'\"-]"
 #: Folders that may name their owner: of absolute paths, of those from ~, and of those with "..".
 _FOLDERS = re.compile(r"(^|[\s=:,])(?:/|~[^\s=:,/]*|(?:[^\s=:,]*/)?\.\./)(?:[^=:,]*/)?")
+#: What the name of a split ends with in a run with `--validation`.
+_OF_VALIDATION = "-validation"
 #: Takes the actions [B, N] that are given as its weights.
 _RECORDED = Policy(
     start=lambda actions, batch: jnp.int32(0),
@@ -60,6 +65,11 @@ class Row:
     config: TrainConfig | None  # None for a policy that was not trained here
     metrics: Sequence[journal.Row]  # none if it is not known how it learned
     processes: Sequence[Process]  # that trained or evaluated it, oldest first
+
+    @property
+    def of_validation(self) -> bool:
+        """Whether it is a run for choosing settings, not one on a test."""
+        return self.name.startswith(VALIDATION)
 
     @property
     def agent(self) -> str:
@@ -105,23 +115,31 @@ def _typed(flag: str, value: Any) -> str:
 
 
 def rows(folder: Path | str) -> list[Row]:
-    """The rows in a folder, by name.
+    """The rows in a folder, by name: those of tests, then those of validation.
 
     Raises:
       FileError: a file of a row cannot be read.
     """
-    return [read(path.parent) for path in sorted(Path(folder).glob(f"*/{report.RESULTS_FILE}"))]
+    folder = Path(folder)
+    return [
+        read(path.parent, path.parent.relative_to(folder).as_posix())
+        for kind in ("", VALIDATION)
+        for path in sorted(folder.glob(f"{kind}*/{report.RESULTS_FILE}"))
+    ]
 
 
-def read(folder: Path | str) -> Row:
+def read(folder: Path | str, name: str | None = None) -> Row:
     """The row, or the finished run, in a folder.
+
+    Args:
+      name: of the row; by default that of the folder.
 
     Raises:
       FileError: a file is missing or cannot be read.
     """
     folder = Path(folder)
     return Row(
-        name=folder.name,
+        name=folder.name if name is None else name,
         results=results_file.read(folder / report.RESULTS_FILE),
         config=_read_config(folder / CONFIG_FILE) if (folder / CONFIG_FILE).exists() else None,
         metrics=journal.read_metrics(folder) if (folder / METRICS_FILE).exists() else [],
@@ -161,12 +179,12 @@ def add(
       The folder of the row.
 
     Raises:
-      ValueError: a file is missing or cannot be read, it is no result of the official test in
-        today's rooms, its code was not committed, or the name or the seed are there already; one
-        line that names it.
+      ValueError: a file is missing or cannot be read, it is no result of the official test or
+        validation in today's rooms, its code was not committed, or the name or the seed are there
+        already; one line that names it.
     """
     run, out = Path(run), Path(folder) / name
-    if not re.fullmatch(r"\w[\w.-]*", name):
+    if not re.fullmatch(r"\w[\w.-]*", name.removeprefix(VALIDATION)):
         raise ValueError(f"--name {name}: letters, digits and _; after the first, . and - as well")
     if name in NAMED:
         raise ValueError(f"--name {name}: is the name of a split")
@@ -180,13 +198,12 @@ def add(
         if str(commit).endswith("-dirty"):
             raise ValueError(f"{run}: made with changes that are not committed, {commit}")
     check(run, row)
-    records = regular.read_bytes(run / report.EPISODES_FILE, links=False)
     if row.config is not None:
         row = dataclasses.replace(row, config=_without_folders(row.config))
     for other in rows(folder):
         if _identity(other) == _identity(row):
-            raise ValueError(f"{run}: {out.parent / other.name} has this agent with this seed")
-    out.parent.mkdir(exist_ok=True)
+            raise ValueError(f"{run}: {folder}/{other.name} has this agent with this seed")
+    out.parent.mkdir(parents=True, exist_ok=True)
     with files.replacing(out) as fresh:
         fresh.mkdir()
         if row.config is not None:
@@ -195,21 +212,28 @@ def add(
             metrics = regular.read_bytes(run / METRICS_FILE, links=False)
             (fresh / METRICS_FILE).write_bytes(metrics)
         run_file.write(fresh, processes)
-        (fresh / report.EPISODES_FILE).write_bytes(records)
+        if not row.of_validation:
+            records = regular.read_bytes(run / report.EPISODES_FILE, links=False)
+            (fresh / report.EPISODES_FILE).write_bytes(records)
         results = regular.read_bytes(run / report.RESULTS_FILE, links=False)
         (fresh / report.RESULTS_FILE).write_bytes(results)
     return out
 
 
 def check(run: Path, row: Row) -> None:
-    """Raises ValueError unless results are those of the official test, as its episodes give them.
+    """Raises ValueError unless results are those of the official test, as its episodes give them,
+    or of validation.
 
     Args:
       run: the folder of the run, or of the row.
       row: what was read from it.
     """
     results, path = row.results, run / report.RESULTS_FILE
-    split, policy = results["split"], results["policy"]
+    split, policy = results["split"].removesuffix(_OF_VALIDATION), results["policy"]
+    if row.of_validation != (split != results["split"]):
+        raise FileError(
+            path, f"split {results['split']}: {VALIDATION} has all runs with --validation"
+        )
     if results.get("departures"):
         raise FileError(path, describe_departures(results["departures"]))
     if split not in NAMED:
@@ -225,9 +249,10 @@ def check(run: Path, row: Row) -> None:
         raise FileError(run / CONFIG_FILE, "no such file; is this the folder of a run?")
     if row.config is not None and policy != "sample":
         raise FileError(path, f"{policy} actions: the scoreboard is of sampled ones")
-    if not (run / report.EPISODES_FILE).exists():
-        raise FileError(run / report.EPISODES_FILE, "no such file")
-    _check_episodes(run, results)
+    if not row.of_validation:
+        if not (run / report.EPISODES_FILE).exists():
+            raise FileError(run / report.EPISODES_FILE, "no such file")
+        _check_episodes(run, results)
 
 
 def _check_episodes(run: Path, results: Result) -> None:

@@ -2,27 +2,34 @@
 
 A block begins with `<!-- scoreboard: ... -->` and ends with `<!-- end -->`, each on a line of its
 own. If it names a split, it is that split's part of the scoreboard; if it names rows, a table of
-these.
+these; if it is a pattern, such as validation/rooms-*, a table of the agents of these rows.
 """
 
 from __future__ import annotations
 
+import fnmatch
+import functools
 import hashlib
 import json
 import re
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from tdanet_jax.analysis import figures
+from tdanet_jax.config import CONFIG_FILE
 from tdanet_jax.evaluation import comparison, metrics, paper
 from tdanet_jax.io import files
 from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.io.untrusted import FileError
-from tdanet_jax.splits import GROUPS, NAMED, file_name
-from tdanet_jax.workflows.scoreboard import Row
+from tdanet_jax.splits import GROUPS, NAMED, file_name, make_split
+from tdanet_jax.workflows.scoreboard import VALIDATION, Row
 
+#: What the names of the rows begin with that show what more rooms give.
+ROOMS = f"{VALIDATION}rooms-"
 MARK = "<!-- scoreboard: "
+_HEADS = ("Agent", "Senses beyond the paper's", "Seeds", "Steps", "Hours")
 _BLOCK = re.compile(rf"^{MARK}([^\n]+) -->\n(.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
 
 
@@ -58,6 +65,11 @@ def filled(path: Path, text: str, rows: Sequence[Row]) -> str:
             raise FileError(path, f"{MARK}{block[1]} --> has no <!-- end -->")
         if block[1] in NAMED:
             lines = of_split(block[1], rows)
+        elif "*" in block[1]:
+            chosen = [row for row in rows if fnmatch.fnmatchcase(row.name, block[1])]
+            if not chosen:
+                raise FileError(path, f"scoreboard: no row {block[1]}")
+            lines = of_agents(chosen)
         else:
             if unknown := [name for name in block[1].split() if name not in by_name]:
                 raise FileError(path, f"scoreboard: no row {', '.join(unknown)}")
@@ -87,12 +99,27 @@ def of_rows(rows: Iterable[Row]) -> list[str]:
     return comparison.table(("Row",), shown, buckets=(bucket,), measures=measures)
 
 
+def of_agents(rows: Iterable[Row]) -> list[str]:
+    """A table of the agents of rows, in their order: SR and SPL of all and of long episodes."""
+    agents = _by_agent(rows)
+    shown = [
+        (_of_agent(agent, seeds), comparison.summary([row.results for row in seeds]))
+        for agent, seeds in agents.items()
+    ]
+    return ["", *comparison.table(_HEADS, shown, measures=comparison.MEASURES), ""]
+
+
+def _by_agent(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    agents: dict[str, list[Row]] = {}
+    for row in rows:
+        agents.setdefault(row.agent, []).append(row)
+    return agents
+
+
 def of_split(split: str, rows: Iterable[Row]) -> list[str]:
     """A split's part of the scoreboard: its agents, the paper's, learning curves, and the runs."""
     own = sorted((row for row in rows if row.results["split"] == split), key=lambda row: row.name)
-    agents: dict[str, list[Row]] = {}
-    for row in own:
-        agents.setdefault(row.agent, []).append(row)
+    agents = _by_agent(own)
     summaries = {
         agent: comparison.summary([row.results for row in seeds]) for agent, seeds in agents.items()
     }
@@ -104,8 +131,7 @@ def of_split(split: str, rows: Iterable[Row]) -> list[str]:
     shown = [(_of_agent(agent, agents[agent]), summaries[agent]) for agent in best_first] + [
         ((f"{agent} (paper)", "", "", "", ""), groups) for agent, groups in published.items()
     ]
-    heads = ("Agent", "Senses beyond the paper's", "Seeds", "Steps", "Hours")
-    lines = comparison.table(heads, shown, groups=present, measures=("SR", "SPL", "CF-SR"))
+    lines = comparison.table(_HEADS, shown, groups=present, measures=("SR", "SPL", "CF-SR"))
     lines += ["", paper.worlds(None)] if published else []
     if any(row.metrics for row in own):
         name = picture(split)
@@ -172,15 +198,46 @@ def write(root: Path | str, rows: Sequence[Row]) -> list[Path]:
             files.write_text(path, text)
             changed.append(path)
     for split in NAMED:
-        path = root / "docs" / picture(split)
-        before = path.read_bytes() if path.exists() else None
         runs = [row for row in rows if row.results["split"] == split and row.metrics]
         curves = [(row.agent, row.metrics) for row in runs]
-        mark = hashlib.sha256(json.dumps(curves).encode()).hexdigest()
-        if not curves and before is not None:
-            path.unlink()
-            changed.append(path)
-        elif curves and (before is None or mark.encode() not in before):
-            figures.training_curves(curves, f"Split {split}, training rooms", path, mark)
-            changed.append(path)
+        draw = functools.partial(figures.training_curves, curves, f"Split {split}, training rooms")
+        changed += _drawn(root / "docs" / picture(split), curves, draw)
+    points = [_room_point(row) for row in rows if row.name.startswith(ROOMS)]
+    changed += _drawn(
+        root / "docs" / "room_curve.png", points, functools.partial(figures.room_curve, points)
+    )
     return changed
+
+
+def _drawn(path: Path, content: Sequence[Any], draw: Callable[[Path, str], None]) -> list[Path]:
+    """Draws a picture whose content has changed, or deletes one without content; it, if so."""
+    before = path.read_bytes() if path.exists() else None
+    mark = hashlib.sha256(json.dumps(content).encode()).hexdigest()
+    if content and (before is None or mark.encode() not in before):
+        draw(path, mark)
+    elif not content and before is not None:
+        path.unlink()
+    else:
+        return []
+    return [path]
+
+
+def _room_point(row: Row) -> tuple[str, int, dict[str, dict[str, float]]]:
+    """The kind and number of a run's training rooms, and its SR and SPL by group.
+
+    Raises:
+      ValueError: the run was not trained here.
+    """
+    config, results = row.config, row.results
+    if config is None:
+        raise ValueError(f"{row.name}: no {CONFIG_FILE}")
+    own = len(make_split(config.split, config.validation).train_scenes)
+    kinds = {
+        "real": 0 if config.generated_only else own,
+        f"variants of the {own}": config.variants * own,
+        "generated": config.generated,
+    }
+    kind = " and ".join(name for name, count in kinds.items() if count)
+    bucket = {group: results[group]["L>=1"] for group in GROUPS}
+    found = {group: {m: bucket[group][m] for m in comparison.MEASURES} for group in GROUPS}
+    return kind, sum(kinds.values()), found

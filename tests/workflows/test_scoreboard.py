@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from matplotlib.image import imread
 
+from tdanet_jax.analysis import figures
 from tdanet_jax.config import BEST, PRESETS
 from tdanet_jax.tools import scoreboard as tool
 from tdanet_jax.training import run_file
@@ -22,7 +23,11 @@ from tdanet_jax.workflows import scoreboard, scoreboard_page
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
-NAMES = sorted(path.name for path in RESULTS.iterdir())
+NAMES = [
+    path.parent.relative_to(RESULTS).as_posix()
+    for kind in ("*", "validation/*")
+    for path in sorted(RESULTS.glob(f"{kind}/results.json"))
+]
 COMMAND = "tdanet train --split 18/4 --seed 7 --out /home/me/runs/x --word-vectors=/home/me/w.txt"
 
 
@@ -45,7 +50,7 @@ def test_the_pages_are_those_that_write_makes(clone: Path) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_row_agrees_with_its_own_episodes(name: str) -> None:
-    scoreboard.check(RESULTS / name, scoreboard.read(RESULTS / name))
+    scoreboard.check(RESULTS / name, scoreboard.read(RESULTS / name, name))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -265,6 +270,84 @@ def test_a_policy_of_ones_own_is_an_agent_of_its_own(run: Path, tmp_path: Path) 
     assert agents[0].startswith("| <code>18-4-mine</code> |  |  |  |  | 91.6 |")
     assert agents[1].startswith("| <code>18-4-theirs</code> |  |  |  |  | 91.6 |")
     assert "| `results/18-4-mine` |  | EPYC | abc | <code>python own.py</code> |" in lines
+
+
+@pytest.fixture
+def of_validation(run: Path) -> Path:
+    """A finished run with --validation in generated rooms alone."""
+    edit(run / "results.json", split="18/4-validation")
+    edit(run / "config.json", validation=True, generated=1000, generated_only=True, steps=3_000_000)
+    (run / "episodes.jsonl").unlink()
+    return run
+
+
+def test_runs_for_choosing_settings_stand_apart(of_validation: Path, tmp_path: Path) -> None:
+    run, results = of_validation, tmp_path / "results"
+    shutil.copytree(RESULTS / "18-4-random", results / "18-4-random")
+    with pytest.raises(ValueError, match=r"split 18/4-validation: validation/ has all runs with"):
+        scoreboard.add(run, "mine", results)
+    with pytest.raises(ValueError, match=r"--name validation/\.\./x: letters"):
+        scoreboard.add(run, "validation/../x", results)
+    out = scoreboard.add(run, "validation/rooms-generated-7", results)
+    assert out == results / "validation" / "rooms-generated-7"
+    with pytest.raises(ValueError, match="validation/rooms-generated-7 has this agent with this"):
+        scoreboard.add(run, "validation/again", results)
+    edit(run / "results.json", seed=8)
+    edit(run / "config.json", seed=8)
+    scoreboard.add(run, "validation/rooms-generated-8", results)
+    edit(run / "results.json", split="18/4")
+    with pytest.raises(ValueError, match="split 18/4: validation/ has all runs with --validation"):
+        scoreboard.add(run, "validation/test", results)
+    rows = scoreboard.rows(results)
+    assert [row.name for row in rows] == [
+        "18-4-random", "validation/rooms-generated-7", "validation/rooms-generated-8"
+    ]  # fmt: skip
+    # Nothing of them is on the scoreboard of the test.
+    assert not any("generated" in line for line in scoreboard_page.of_split("18/4", rows))
+    text = scoreboard_page.filled(
+        Path("page.md"), "<!-- scoreboard: validation/rooms-* -->\n<!-- end -->\n", rows
+    )
+    flags = "--preset robust --steps 3000000 --generated 1000 --generated-only"
+    (line,) = (line for line in text.splitlines() if "--generated" in line)
+    assert line.startswith(f"| <code>tdanet {flags}")
+    assert "| 7, 8 | 12.0 M | 6.00 | 91.6 ± 0.0 |" in line
+    with pytest.raises(ValueError, match=r"no row validation/no-\*"):
+        scoreboard_page.filled(
+            Path("page.md"), "<!-- scoreboard: validation/no-* -->\n<!-- end -->\n", rows
+        )
+
+
+def test_rooms_and_what_they_give_are_drawn(
+    of_validation: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = tmp_path / "results"
+    for name, values in {
+        "rooms-generated": {},
+        "rooms-real": {"generated": 0, "generated_only": False},
+        "rooms-both": {"generated_only": False, "variants": 2},
+    }.items():
+        edit(of_validation / "config.json", **values)
+        scoreboard.add(of_validation, f"validation/{name}", results)
+    drawn: list[Any] = []
+    draw = figures.room_curve
+
+    def noted(points: Any, path: Path, mark: str) -> None:
+        drawn.append(points)
+        draw(points, path, mark)
+
+    monkeypatch.setattr(figures, "room_curve", noted)
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "README.md").touch()
+    picture = tmp_path / "docs" / "room_curve.png"
+    assert scoreboard_page.write(tmp_path, scoreboard.rows(results)) == [picture]
+    assert scoreboard_page.write(tmp_path, scoreboard.rows(results)) == []
+    (points,) = drawn
+    unseen = json.loads((of_validation / "results.json").read_text())["unseen"]["L>=1"]
+    assert {kind: count for kind, count, _ in points} == {
+        "generated": 1000, "real": 64, "real and variants of the 64": 192
+    }  # fmt: skip
+    assert all(found["unseen"] == {m: unseen[m] for m in ("SR", "SPL")} for *_, found in points)
+    assert imread(picture).std() > 0.01
 
 
 def test_an_agent_is_called_by_its_flags() -> None:
