@@ -276,7 +276,8 @@ def test_a_policy_of_ones_own_is_an_agent_of_its_own(run: Path, tmp_path: Path) 
 def of_validation(run: Path) -> Path:
     """A finished run with --validation in generated rooms alone."""
     edit(run / "results.json", split="18/4-validation")
-    edit(run / "config.json", validation=True, generated=1000, generated_only=True, steps=3_000_000)
+    rooms = {"validation": True, "generated": 1000, "generated_only": True}
+    edit(run / "config.json", **rooms, steps=3_000_000, word_vectors=None)
     (run / "episodes.jsonl").unlink()
     return run
 
@@ -307,7 +308,7 @@ def test_runs_for_choosing_settings_stand_apart(of_validation: Path, tmp_path: P
     text = scoreboard_page.filled(
         Path("page.md"), "<!-- scoreboard: validation/rooms-* -->\n<!-- end -->\n", rows
     )
-    flags = "--preset robust --steps 3000000 --generated 1000 --generated-only"
+    flags = "--preset robust --steps 3000000 --validation --generated 1000 --generated-only"
     (line,) = (line for line in text.splitlines() if "--generated" in line)
     assert line.startswith(f"| <code>tdanet {flags}")
     assert "| 7, 8 | 12.0 M | 6.00 | 91.6 ± 0.0 |" in line
