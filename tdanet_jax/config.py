@@ -183,8 +183,9 @@ class TrainConfig:
     """Requires --generated. Train in generated rooms alone. Parents of targets and the class graph
     are those of the training rooms in any case."""
     pool_rooms: int = 1500
-    """Variants and generated rooms in memory at once. If there are more, pools of about as many
-    take turns, and the next is built or loaded meanwhile."""
+    """Most variants and generated rooms of a pool. If there are more, pools take turns: the first,
+    the present and the next one are in memory, and the next is built or loaded meanwhile. They are
+    made of files of 100 generated rooms, or of a variant of each room."""
     pool_updates: int = 200
     """Updates in a pool before the next one's turn, rounded to whole calls of --chunk-updates."""
     chunk_updates: int = 10

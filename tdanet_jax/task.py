@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -103,6 +104,8 @@ class Task:
             )
 
 
+#: More than can be added to the training rooms.
+ALL_ROOMS = 1_000_000
 #: What the names of environments begin with.
 ITHOR = "ithor-"
 
@@ -120,7 +123,7 @@ def make(
       split: "train" has the training rooms and no trace of unseen classes; "test" begins episodes
         in the test rooms, for seen and unseen targets, with the step limits of tests.
       config: what else can be set: sensors, rows, step limit, rewards, rooms of your own. Its
-        `split` is replaced by the name's.
+        `split` is replaced by the name's. All variants and generated rooms are in one pool.
 
     Raises:
       ValueError: no environment has this name, or a file of the configuration is broken.
@@ -129,7 +132,9 @@ def make(
         raise ValueError(f"{name}: no such environment; try {ITHOR}18/4")
     if split not in ("train", "test"):
         raise ValueError(f"split {split!r}: must be 'train' or 'test'")
-    config = dataclasses.replace(config or TrainConfig(), split=name.removeprefix(ITHOR))
+    config = dataclasses.replace(
+        config or TrainConfig(), split=name.removeprefix(ITHOR), pool_rooms=ALL_ROOMS
+    )
     config.check()
     task = load_task(config if split == "train" else config.in_rooms_alone())
     env = environment(task, name, split)
@@ -174,22 +179,32 @@ def task_in(rooms: Rooms, config: TrainConfig, progress: Progress | None = None)
     config, features = resolve(dataclasses.replace(config, data=data)), None
     if rooms.path is not None and config.network.image == "features":
         features = load_features(rooms.path, rooms.tables)
-    try:
+    with _naming(rooms.path):
         added: list[Part] = []
         for kind, count in ((variants, config.variants), (generated, config.generated)):
             if count:
                 names = _split(config, rooms)[1].train_scenes
                 added += kind.parts(rooms, names, count)
-        dealt = [
-            functools.partial(pools.load, pool, rooms.tables.classes)
-            for pool in pools.deal(added, config.pool_rooms)
-        ]
-        varied = dealt[0](progress) if dealt else None
-        return make_task(config, rooms.tables, vectors, rooms.extras, features, varied, dealt[1:])
+        dealt = pools.deal(added, config.pool_rooms)
+        first = pools.load(dealt[0], rooms.tables.classes, progress) if dealt else None
+        further = [functools.partial(_load_pool, rooms, pool) for pool in dealt[1:]]
+        return make_task(config, rooms.tables, vectors, rooms.extras, features, first, further)
+
+
+@contextlib.contextmanager
+def _naming(path: Path | None) -> Iterator[None]:
+    """Errors inside name the file of imported rooms."""
+    try:
+        yield
     except ValueError as error:
-        if rooms.path is None:
+        if path is None:
             raise
-        raise ValueError(f"{rooms.path}: {error}") from None
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _load_pool(rooms: Rooms, pool: Sequence[Part], progress: Progress) -> SceneTables:
+    with _naming(rooms.path):
+        return pools.load(pool, rooms.tables.classes, progress)
 
 
 def make_task(

@@ -120,7 +120,8 @@ def room_curve(
                 means = [np.mean([rate for n, rate in runs if n == count]) for count in counts]
                 color = PALETTE[index % len(PALETTE)]
                 axis.plot(counts, means, "-", color=color, linewidth=1)
-                axis.plot(*zip(*runs, strict=True), MARKERS[index], color=color, label=kind)
+                marker = MARKERS[index % len(MARKERS)]
+                axis.plot(*zip(*runs, strict=True), marker, color=color, label=kind)
             axis.set(xscale="log", ylabel=f"{group} targets, {measure}, per cent")
             axis.grid(alpha=0.3)
             axis.spines[["top", "right"]].set_visible(False)

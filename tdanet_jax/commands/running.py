@@ -115,7 +115,7 @@ class Reports(Callbacks):
         console.quiet = not devices.is_lead()
 
     def on_rooms(self, done: float, total: int) -> None:
-        self._show("rooms", done / total, "rebuilt")
+        self._show("rooms", done / total, "ready")
 
     def on_note(self, text: str) -> None:
         self._clear()

@@ -73,11 +73,11 @@ class EnvParams(struct.PyTreeNode):
         )
 
     def padded(self, other: EnvParams, spare: float = 0.0) -> EnvParams:
-        """The same, with tables at least as long as those of `other`, so that one program serves
-        both; nothing reads the padding.
+        """The same rooms in tables at least as long as those of `other`, so that one program serves
+        both. Nothing reads the padding, but what noise draws depends on `max_detections`.
 
         Args:
-          spare: of what has to be longer, as a share of its length, so that it need not be again.
+          spare: share by which all of these tables are lengthened, so that those of others fit too.
         """
         rows = max(self.max_detections, other.max_detections)
         params = self if rows == self.max_detections else self.with_rows(rows)

@@ -18,7 +18,7 @@ class Part(NamedTuple):
 
 
 def deal(parts: Sequence[Part], most: int) -> list[list[Part]]:
-    """Parts in as few pools as have at most about `most` rooms each.
+    """Parts in as many pools as would have at most `most` rooms each if parts were all alike.
 
     Kinds of rooms are spread over the pools: of n pools, the first has parts 1, n + 1, ...
     """
@@ -34,7 +34,8 @@ def load(
 
     Args:
       classes: the vocabulary of the training rooms.
-      progress: called with (rooms done, rooms of the pool) while any are built.
+      progress: called with (rooms done, rooms of the pool) before each part and while rooms are
+        built.
 
     Raises:
       SceneError: the training rooms do not say what lies on what.
@@ -47,6 +48,7 @@ def load(
             if progress is not None:
                 progress(before + more, total)
 
+        report(0.0, part.rooms)
         tables.append(part.load(report))
         done += part.rooms
     return tabulation.join(tables, classes)

@@ -79,7 +79,10 @@ class NoiseParams(struct.PyTreeNode):
     low: jax.Array  # [17] float32, least levels of an episode, in the order of `NoiseLevels`
     high: jax.Array  # [17] float32, greatest levels
     corners: jax.Array  # [N + K, 4] float32, x1, y1, x2, y2 of each detection's extent
-    known: jax.Array  # [A] int32, ascending: the classes that are detected anywhere
+    known: (
+        jax.Array
+    )  # [C] int32, ascending: the A classes that are detected anywhere, then the last
+    known_count: jax.Array  # [] int32, A
     similar: jax.Array  # [C, SIMILAR] int32, what a class is confused with
     rows: jax.Array  # [] int32, N, detections in the tables
     one_per_class: bool = struct.field(pytree_node=False)  # frames have one row per class
@@ -119,7 +122,8 @@ def make_params(
     return NoiseParams(
         **levels_of(noise),
         corners=jnp.asarray(np.pad(corners.astype(np.float32), ((0, padding), (0, 0)))),
-        known=jnp.asarray(known, jnp.int32),
+        known=jnp.asarray(np.pad(known, (0, len(names) - len(known)), mode="edge"), jnp.int32),
+        known_count=jnp.int32(len(known)),
         similar=jnp.asarray(_similar_classes(words, names, known), jnp.int32),
         rows=jnp.int32(len(classes)),
         one_per_class=one_per_class,
@@ -241,11 +245,10 @@ def _labels(
     chance = _uniform(bits[_CHANGE])
     swap = (chance < levels.swaps) & ~is_false
     confuse = ~swap & (chance < levels.swaps + (1 - levels.swaps) * levels.confusions) & ~is_false
-    others = max(params.known.shape[0] - 1, 1)
-    pick = _index(bits[_CLASS], jnp.int32(others))
+    pick = _index(bits[_CLASS], jnp.maximum(params.known_count - 1, 1))
     # The known classes are ascending: skipping the own one leaves `others` of them.
     at = pick + (params.known[pick] >= classes)
-    other = params.known[jnp.minimum(at, params.known.shape[0] - 1)]
+    other = params.known[jnp.minimum(at, params.known_count - 1)]
     alike = params.similar[classes, (bits[_CLASS] >> 14).astype(jnp.int32)]
     return jnp.where(swap, other, jnp.where(confuse, alike, classes))
 

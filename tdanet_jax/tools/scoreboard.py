@@ -26,7 +26,8 @@ class Add:
     folder: tyro.conf.Positional[RunPath]
     """Its folder, or a bundled agent's name."""
     name: str
-    """Name of the row: of its folder in results/."""
+    """Name of the row: of its folder in results/. A run with --validation is called
+    validation/NAME."""
     command: str | None = None
     """The one plain command by which it was made, in quotes, if its run.json does not tell."""
     machine: str | None = None

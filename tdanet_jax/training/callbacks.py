@@ -20,7 +20,8 @@ class Callbacks:
     """The command line that trains the runs, for their `run.json`."""
 
     def on_rooms(self, done: float, total: int) -> None:
-        """So many of the bundled rooms have been rebuilt; only on a machine's first start."""
+        """So many of the rooms that are needed next are there: bundled rooms on a machine's first
+        start, variants and generated rooms until they are cached, a pool of them for its turn."""
 
     def on_note(self, text: str) -> None:
         """Something worth a line."""

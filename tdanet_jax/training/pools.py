@@ -4,71 +4,111 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.sharding import NamedSharding
 
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.task import Task
+from tdanet_jax.training import devices
 
-#: What the tables of the first pool are lengthened by, as a share, so that those of the next ones
-#: fit as well: a pool with longer ones is compiled anew.
+#: Share by which the tables of the first pool are lengthened, so that later ones fit as well: a
+#: longer one is compiled anew.
 SPARE = 0.05
 
 
 class Pools:
-    """The environments in a run's pools of rooms, which take turns; turns are numbered from 0."""
+    """The pools of rooms of a run, or of several seeds that train together.
 
-    def __init__(self, task: Task, config: TrainConfig) -> None:
-        self._task = task
-        self._config = config
+    Pools take turns, numbered from 0. `params` is the environment of turn `entered`.
+    """
+
+    def __init__(self, task: Task, config: TrainConfig, sharding: NamedSharding) -> None:
+        """Enters the first pool.
+
+        Args:
+          sharding: where tables lie.
+        """
+        self._task, self._config, self._sharding = task, config, sharding
         self._count = 1 + len(task.further_pools)
         chunks = max(1, round(config.pool_updates / config.chunk_updates))
         self._updates = chunks * config.chunk_updates  # in a turn
         self._loading: _Loading | None = None
+        first = task.train_params
+        if self._count > 1:
+            first = first.padded(first, SPARE)
+        self.entered = 0
+        self.params: EnvParams = jax.device_put(first, sharding)
+
+    @property
+    def shapes(self) -> tuple[Any, list[tuple[int, ...]]]:
+        """All of the environment that a program is compiled for."""
+        leaves, tree = jax.tree.flatten(self.params)
+        return tree, [leaf.shape for leaf in leaves]
 
     def turn(self, updates: int) -> int:
         """The turn in which an update after so many takes place; always 0 with a single pool."""
         return updates // self._updates if self._count > 1 else 0
 
-    def prepare(self, turn: int) -> None:
-        """Begins to load the environment of a turn in the background, if the budget reaches it."""
-        number, steps = turn % self._count, turn * self._updates * self._config.steps_per_update
-        if number and self._loading is None and self._config.spent(steps, 0, 0.0) < 1.0:
-            self._loading = _Loading(number, self._task.further_pools[number - 1])
+    def lengthen_frames(self, rows: int) -> None:
+        """Makes frames at least so long, as they were when a checkpoint was written.
 
-    def waits(self, turn: int, seconds: float) -> tuple[float, int] | None:
-        """Waits at most so long for the environment of a turn: (rooms done, rooms); None if loaded.
+        With noise, what an episode draws depends on it.
+        """
+        if rows > self.params.max_detections:
+            self.params = jax.device_put(self.params.with_rows(rows), self._sharding)
 
-        Its rooms count only while they are built.
+    def wait(self, turn: int, seconds: float) -> tuple[float, int] | None:
+        """Waits at most so long for the environment of a turn.
+
+        Returns:
+          (rooms done, rooms of the pool) until it can be entered, then None.
         """
         number = turn % self._count
-        if not number:
+        if not number or turn == self.entered:
             return None
-        if self._loading is None or self._loading.number != number:
-            self.close()
-            self._loading = _Loading(number, self._task.further_pools[number - 1])
-        return self._loading.waits(seconds)
+        return self._load(number).wait(seconds)
 
-    def params(self, turn: int) -> EnvParams:
-        """The environment of a turn, when it is loaded.
+    def enter(self, turn: int) -> None:
+        """Takes the environment of a turn, with tables at least as long as those before, and begins
+        to load the next one if the budget reaches it.
 
         Raises:
-          ValueError: its rooms cannot be built or read.
+          Exception: the rooms cannot be built or read, here or in another process; nothing has
+            changed then.
         """
-        if turn % self._count == 0:
-            first = self._task.train_params
-            return first if self._count == 1 else first.padded(first, SPARE)
-        while self.waits(turn, 1.0) is not None:
-            pass
-        assert self._loading is not None
-        loaded, self._loading = self._loading, None
-        return loaded.result()
+        if turn != self.entered:
+            number, found = turn % self._count, None
+            error: Exception | None = None
+            try:
+                found = self._load(number).result() if number else self._task.train_params
+            except Exception as reason:
+                error = reason
+            if devices.anywhere(error is not None) or found is None:
+                raise error or ValueError("another process could not build the next rooms")
+            self._loading = None
+            self.params = jax.device_put(found.padded(self.params), self._sharding)
+            self.entered = turn
+        following = (turn + 1) % self._count
+        steps = (turn + 1) * self._updates * self._config.steps_per_update
+        if following and self._config.spent(steps, 0, 0.0) < 1.0:
+            self._load(following)
 
     def close(self) -> None:
         """Stops loading."""
         if self._loading is not None:
             self._loading.stop()
             self._loading = None
+
+    def _load(self, number: int) -> _Loading:
+        """Loading of a pool other than the first, begun now or before."""
+        if self._loading is None or self._loading.number != number:
+            self.close()
+            self._loading = _Loading(number, self._task.further_pools[number - 1])
+        return self._loading
 
 
 class _Loading:
@@ -94,11 +134,12 @@ class _Loading:
             raise InterruptedError
         self._done = done, total
 
-    def waits(self, seconds: float) -> tuple[float, int] | None:
+    def wait(self, seconds: float | None = None) -> tuple[float, int] | None:
         self._thread.join(seconds)
         return self._done if self._thread.is_alive() else None
 
     def result(self) -> EnvParams:
+        self._thread.join()
         assert self._found is not None
         if isinstance(self._found, Exception):
             raise self._found
@@ -106,3 +147,4 @@ class _Loading:
 
     def stop(self) -> None:
         self._stopped = True
+        self._thread.join(10.0)

@@ -6,7 +6,6 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,12 +29,18 @@ class Run:
     """
 
     def __init__(
-        self, folder: Path | str, config: TrainConfig, task: Task, mesh: Mesh | None = None
+        self,
+        folder: Path | str,
+        config: TrainConfig,
+        task: Task,
+        mesh: Mesh | None = None,
+        pools: Pools | None = None,
     ) -> None:
         """The run in `folder`, new or from its newest checkpoint.
 
         Args:
           mesh: the devices that the environments are split over; by default the first alone.
+          pools: of another seed of the run, for seeds that train together.
 
         Raises:
           ValueError: the checkpoint does not fit the configuration or the rooms.
@@ -49,11 +54,16 @@ class Run:
         self.mesh = mesh or devices.first()
         self._shared = devices.everywhere(self.mesh)
         self._words = jax.device_put(task.train_words, self._shared)
-        self._pools = Pools(task, config)
-        self._turn = 0  # of the pool whose rooms `state` is in
-        self._params = jax.device_put(self._pools.params(0), self._shared)
-        shapes = jax.eval_shape(self._init, jax.random.key(0), self._words, self._params)
+        self.pools = pools or Pools(task, config, self._shared)
+        self._closes_pools = pools is None
+        self._turn = 0  # whose rooms the episodes in progress are in
+        shapes = jax.eval_shape(self._init, jax.random.key(0), self._words, self.pools.params)
         self._layout = devices.layout(shapes, self.mesh)
+        self._begin_again = jax.jit(
+            lambda state, params: learner.begin_again(state, config.learner, self.model, params),
+            out_shardings=self._layout,
+            donate_argnums=0,
+        )
         self.checkpoints = Checkpoints(folder)
         self._journal: Journal | None = None
         self._saved: int | None = None  # updates of the checkpoint with the present state
@@ -73,12 +83,12 @@ class Run:
 
     def _begin(self) -> TrainState:
         init = jax.jit(self._init, out_shardings=self._layout)
-        return init(jax.random.key(self.config.seed), self._words, self._params)
+        return init(jax.random.key(self.config.seed), self._words, self.pools.params)
 
     def _restore(self) -> TrainState:
         def make_state(rows: int | None) -> TrainState:
-            more = max(rows or 0, self._params.max_detections)
-            return self._init(jax.random.key(0), self._words, self._params.with_rows(more))
+            more = max(rows or 0, self.pools.params.max_detections)
+            return self._init(jax.random.key(0), self._words, self.pools.params.with_rows(more))
 
         state, meta = self.checkpoints.restore(make_state)
         if meta["data_version"] != self.task.tables.data_version:
@@ -93,19 +103,10 @@ class Run:
             )
         self.seconds = float(meta["seconds"])
         self._saved = int(state.updates)
-        self._turn = self._pools.turn(max(0, self._saved - self.config.chunk_updates))
-        if self._turn:
-            self._enter(self._pools.params(self._turn), meta.get("max_detections", 0))
+        # The last chunk was in these rooms. They are entered only if there is another.
+        self._turn = self.pools.turn(max(0, self._saved - self.config.chunk_updates))
+        self.pools.lengthen_frames(int(meta.get("max_detections", 0)))
         return jax.device_put(state, self._layout)
-
-    def _enter(self, params: EnvParams, rows: int = 0) -> None:
-        """Takes the rooms of a pool, with tables at least as long as those before.
-
-        Args:
-          rows: in a frame, at least.
-        """
-        params = params.with_rows(max(rows, params.max_detections)).padded(self._params)
-        self._params = jax.device_put(params, self._shared)
 
     def save(self) -> None:
         """Writes a checkpoint of the present state, unless there is one.
@@ -120,7 +121,7 @@ class Run:
                 "variants": self.task.variants_version,
             }
             if self.task.further_pools:
-                meta["max_detections"] = self._params.max_detections
+                meta["max_detections"] = self.pools.params.max_detections
             state = devices.whole(self.state, self.mesh)
             if devices.is_lead():
                 self.checkpoints.save(state, meta)
@@ -151,58 +152,46 @@ class Run:
         self._open_journal()
         if self._over(until):
             return
-        chunk = None
+        chunk = compiled_for = None
         try:
             while not self._over(until):
-                changed = self._change_rooms()
-                chunk = self._compile() if chunk is None or changed else chunk
+                self._change_rooms()
+                if compiled_for != (shapes := self.pools.shapes):
+                    chunk, compiled_for = self._compile(), shapes
+                assert chunk is not None
                 before, shares, began = self.progress, self._shares(), time.perf_counter()
-                state, metrics = chunk(self.state, shares, self._words, self._params)
+                state, metrics = chunk(self.state, shares, self._words, self.pools.params)
                 metrics = jax.device_get(metrics)
                 took = devices.from_lead(time.perf_counter() - began)
                 yield self._record(state, metrics, before, took)
                 self._check_finite()
         finally:
-            self._pools.close()
+            if self._closes_pools:
+                self.pools.close()
 
-    def waits_for_rooms(self, seconds: float) -> tuple[float, int] | None:
-        """Waits at most so long for the rooms of the next chunk, if they are others.
+    def wait_for_rooms(self, seconds: float) -> tuple[float, int] | None:
+        """Waits at most so long for the rooms of the next chunk.
 
         Returns:
-          (rooms done, rooms in all) while they are being built; None when they are there.
+          (rooms done, rooms of the pool) while they are not there; None when they are.
         """
-        turn = self._pools.turn(int(self.state.updates))
-        if turn == self._turn or self.progress >= 1.0:
+        if self.progress >= 1.0:
             return None
-        return self._pools.waits(turn, seconds)
+        return self.pools.wait(self.pools.turn(int(self.state.updates)), seconds)
 
     def _change_rooms(self) -> bool:
-        """Enters the rooms of the next chunk, if they are others; True if they are compiled anew.
-
-        Every episode that is in progress ends without a trace, and another begins.
-        """
-        turn, before = self._pools.turn(int(self.state.updates)), self._params
-        if turn != self._turn:
-            try:
-                self._enter(self._pools.params(turn))
-            except ValueError:
-                self.save()
-                raise
+        """Enters the rooms of the next chunk; True if episodes begin again, in other rooms."""
+        turn = self.pools.turn(int(self.state.updates))
+        try:
+            self.pools.enter(turn)
+        except Exception:
+            self.save()
+            raise
+        changed = turn != self._turn
+        if changed:
+            self.state = self._begin_again(self.state, self.pools.params)
             self._turn = turn
-            self._begin_again()
-        self._pools.prepare(turn + 1)
-        return _shapes(before) != _shapes(self._params)
-
-    def _follow(self, other: Run) -> None:
-        """Enters the rooms of another run of the same task."""
-        self._params, self._turn = other._params, other._turn
-        self._begin_again()
-
-    def _begin_again(self) -> None:
-        def again(state: TrainState, params: EnvParams) -> TrainState:
-            return learner.begin_again(state, self.config.learner, self.model, params)
-
-        self.state = jax.jit(again, out_shardings=self._layout)(self.state, self._params)
+        return changed
 
     def _over(self, until: int | None) -> bool:
         stopped = until is not None and int(self.state.updates) >= until
@@ -272,7 +261,7 @@ class Run:
     def _compile(self) -> jax.stages.Compiled:
         config, places = self.config, (self._layout, self._shared)
         chunk = learner.make_train(config.learner, self.model, config.chunk_updates, places)
-        return chunk.lower(self.state, self._shares(), self._words, self._params).compile()
+        return chunk.lower(self.state, self._shares(), self._words, self.pools.params).compile()
 
     def _row(self, metrics: dict[str, np.ndarray], took: float) -> Row:
         """One line of `metrics.jsonl`: means over the chunk's episodes, updates and steps.
@@ -312,11 +301,18 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
     hold its row alone.
 
     Args:
-      runs: seeds of one configuration and task, with a budget in steps.
+      runs: seeds of one configuration and task that share their pools, with a budget in steps.
 
     Raises:
       ValueError: too many updates of a run were skipped; its state is saved first.
     """
+    try:
+        yield from _chunks_together(runs)
+    finally:
+        runs[0].pools.close()
+
+
+def _chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
     furthest = max(int(run.state.updates) for run in runs)
     for run in runs:
         for row in run.chunks(until=furthest):
@@ -334,18 +330,24 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
     def together() -> TrainState:
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(run.state for run in runs))
 
-    lead, stacked, chunk = runs[0], together(), None  # rooms are the lead's
+    lead, stacked = runs[0], together()
+    chunk = compiled_for = None
     for run in runs:
         run._open_journal()
     while lead.progress < 1.0:
-        turn, changed = lead._turn, lead._change_rooms()
-        if lead._turn != turn:
-            for run in runs[1:]:
-                run._follow(lead)
+        try:
+            changed = [run._change_rooms() for run in runs]
+        except Exception:
+            for run in runs:
+                run.save()
+            raise
+        if any(changed):
             stacked = together()
-        arguments = lead._words, lead._params
-        if chunk is None or changed:
+        arguments = lead._words, lead.pools.params
+        if compiled_for != (shapes := lead.pools.shapes):
             chunk = several.lower(stacked, lead._shares(), *arguments).compile()
+            compiled_for = shapes
+        assert chunk is not None
         before, shares, began = lead.progress, lead._shares(), time.perf_counter()
         stacked, metrics = chunk(stacked, shares, *arguments)
         metrics = jax.device_get(metrics)
@@ -357,11 +359,6 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
         yield rows
         for run in runs:
             run._check_finite()
-
-
-def _shapes(params: EnvParams) -> tuple[Any, list[tuple[int, ...]]]:
-    """All that a program is compiled for."""
-    return jax.tree.structure(params), [leaf.shape for leaf in jax.tree.leaves(params)]
 
 
 _UPDATE_MEANS = (

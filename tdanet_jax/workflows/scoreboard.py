@@ -188,6 +188,8 @@ def add(
         raise ValueError(f"--name {name}: letters, digits and _; after the first, . and - as well")
     if name in NAMED:
         raise ValueError(f"--name {name}: is the name of a split")
+    if f"{name}/" == VALIDATION:
+        raise ValueError(f"--name {name}: is the folder of runs with --validation")
     if out.exists():
         raise ValueError(f"--name {name}: {out} exists")
     if not (run / report.RESULTS_FILE).exists():
@@ -231,9 +233,8 @@ def check(run: Path, row: Row) -> None:
     results, path = row.results, run / report.RESULTS_FILE
     split, policy = results["split"].removesuffix(_OF_VALIDATION), results["policy"]
     if row.of_validation != (split != results["split"]):
-        raise FileError(
-            path, f"split {results['split']}: {VALIDATION} has all runs with --validation"
-        )
+        name = "NAME" if row.of_validation else f"{VALIDATION}NAME"
+        raise FileError(path, f"split {results['split']}: call the row {name}")
     if results.get("departures"):
         raise FileError(path, describe_departures(results["departures"]))
     if split not in NAMED:

@@ -184,7 +184,8 @@ def picture(split: str) -> str:
 
 
 def write(root: Path | str, rows: Sequence[Row]) -> list[Path]:
-    """Writes the blocks of all pages, and draws the learning curves that have changed.
+    """Writes the blocks of all pages, and draws the learning curves, and the curve of more rooms,
+    that have changed.
 
     Returns:
       What was not up to date; pictures without rows are deleted.

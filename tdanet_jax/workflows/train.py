@@ -111,12 +111,12 @@ def train_together(members: Sequence[tuple[TrainConfig, Path | str]], callbacks:
     with contextlib.ExitStack() as locks:
         task = load_task(_located(*pairs[0]), callbacks.on_rooms)
         lists = episodes.load(task.tables, task.split, task.extras)
-        runs = []
+        runs: list[Run] = []
         for config, folder in pairs:
             locks.enter_context(files.locked(folder))
             if not (folder / CONFIG_FILE).exists():
                 _check_new(folder)
-            runs.append(Run(folder, config, task))
+            runs.append(Run(folder, config, task, pools=runs[0].pools if runs else None))
             _prepare(runs[-1], callbacks)
             callbacks.on_note(f"{runs[-1].title} -> {folder}")
         if _learn(runs, chunks_together(runs), callbacks):
@@ -195,16 +195,22 @@ def _learn(
             run.save()
         return runs[0].seconds
 
+    def stops() -> bool:
+        if stopped := _waits_or_stops(runs, callbacks):
+            callbacks.on_stop()
+            save()
+        return stopped
+
     saved = save()  # a folder that cannot be written shows before training, not after
     callbacks.on_note("compiling ...")
     with callbacks.shield():
+        if stops():
+            return False
         for rows in chunks:
             callbacks.on_rows(runs, rows)
             for sink in sinks:
                 sink(rows[0])
-            if _stopped(runs[0], callbacks):
-                callbacks.on_stop()
-                save()
+            if stops():
                 return False
             if runs[0].seconds - saved > 60 * runs[0].config.checkpoint_minutes:
                 saved = save()
@@ -212,13 +218,19 @@ def _learn(
     return True
 
 
-def _stopped(run: Run, callbacks: Callbacks) -> bool:
-    """Whether a process stops the run; waits until the rooms of its next chunk are there."""
+def _waits_or_stops(runs: Sequence[Run], callbacks: Callbacks) -> bool:
+    """Waits until the rooms of the next chunk are there; True if a process stops the runs."""
+    furthest = max(run.steps for run in runs)
+    run = next((run for run in runs if run.steps < furthest), runs[0])  # that trains next
+    waits = False
     while not devices.anywhere(callbacks.should_stop()):
-        waits = run.waits_for_rooms(SECONDS_OF_WAITING)
-        if not devices.anywhere(waits is not None):
+        done = run.wait_for_rooms(SECONDS_OF_WAITING if waits else 0.0)
+        if not devices.anywhere(done is not None):
             return False
-        callbacks.on_rooms(*waits or (1.0, 1))
+        if not waits:
+            callbacks.on_note("waiting for the next pool of rooms ...")
+        waits = True
+        callbacks.on_rooms(*done or (1.0, 1))
     return True
 
 

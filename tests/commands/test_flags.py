@@ -715,7 +715,7 @@ def test_checkpoints_are_written_at_their_interval(minutes: float, saves: int) -
     """In five minutes, after whose first and last moment there is one anyway."""
     config = TrainConfig(checkpoint_minutes=minutes)
     run = SimpleNamespace(seconds=0.0, config=config, saved=[])
-    run.waits_for_rooms = lambda seconds: None
+    run.wait_for_rooms, run.steps = lambda seconds: None, 0
     run.save = lambda: run.saved.append(run.seconds)
 
     def chunks() -> Iterator[list[dict[str, Any]]]:

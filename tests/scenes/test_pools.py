@@ -57,5 +57,5 @@ def test_a_pool_is_joined_and_reports_over_all_of_its_parts(ithor: SceneTables) 
     pool = [part(("FloorPlan1", "FloorPlan201")), part(("FloorPlan301",))]
     tables = pools.load(pool, ithor.classes, lambda done, total: told.append((done, total)))
     assert tables.scenes == ("FloorPlan1-v01", "FloorPlan201-v01", "FloorPlan301-v01")
-    assert told == [(0.5, 3), (2, 3), (2.5, 3), (3, 3)]
+    assert told == [(0, 3), (0.5, 3), (2, 3), (2, 3), (2.5, 3), (3, 3)]
     assert pools.load(pool, ithor.classes).data_version == tables.data_version

@@ -21,7 +21,7 @@ from tdanet_jax.scenes import SceneTables
 from tdanet_jax.scenes.scene import SceneError
 from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.task import Task, make_task
-from tdanet_jax.training import learner, pools
+from tdanet_jax.training import devices, learner, pools
 from tdanet_jax.training.callbacks import Callbacks
 from tdanet_jax.training.journal import read_metrics
 from tdanet_jax.training.pools import Pools
@@ -52,7 +52,6 @@ def task_of(
     ithor: SceneTables,
     asked: list[int],
     rooms: tuple[tuple[str, ...], ...] = ROOMS,
-    config: TrainConfig = TINY,
 ) -> Task:
     """A task whose pools are some of the bundled rooms; notes which of them are loaded."""
     first, *others = (named(ithor.subset(names)) for names in rooms)
@@ -66,7 +65,7 @@ def task_of(
         lambda progress, n=n, tables=tables: further(n, tables, progress)
         for n, tables in enumerate(others, start=1)
     ]
-    return make_task(config, ithor, words.load_bundled(), varied=first, further_pools=loads)
+    return make_task(TINY, ithor, words.load_bundled(), varied=first, further_pools=loads)
 
 
 @pytest.fixture(scope="module")
@@ -88,8 +87,8 @@ def whole(
     turns, types = [], []
     for _ in run.chunks():
         turns.append(run._turn)
-        position = np.asarray(run.state.env_state.pose) // run._params.grid.views
-        types.append("".join(map(str, np.unique(run._params.position_room[position]))))
+        position = np.asarray(run.state.env_state.pose) // run.pools.params.grid.views
+        types.append("".join(map(str, np.unique(run.pools.params.position_room[position]))))
     run.save()
     return run, turns, types, [*asked]
 
@@ -133,13 +132,12 @@ def test_one_program_serves_pools_that_fit(
     sizes = {name: len(ithor.subset([name]).row_object) for name in (large, small)}
     if sizes[large] < sizes[small]:
         large, small = small, large
-    config = dataclasses.replace(TINY, learner=dataclasses.replace(TINY.learner, noise="none"))
     compiled: list[Run] = []
     compile_ = Run._compile
     monkeypatch.setattr(Run, "_compile", lambda run: (compiled.append(run), compile_(run))[1])
     for rooms, programs in ((((large,), (small,)), 1), (((small,), (large,)), 2)):
         compiled.clear()
-        run = Run(tmp_path / str(programs), config, task_of(ithor, [], rooms, config))
+        run = Run(tmp_path / str(programs), TINY, task_of(ithor, [], rooms))
         run.folder.mkdir()
         list(run.chunks())
         assert run._turn == 3
@@ -154,6 +152,7 @@ def test_padding_changes_nothing(ithor: SceneTables) -> None:
     assert len(longer.row_class) > 1.09 * len(task.eval_params.row_class)
     assert longer.max_detections == task.eval_params.max_detections > plain.max_detections
     assert len(longer.room_pool) == len(plain.room_pool)
+    more_rows = longer.replace(noise=None)
     longer = plain.padded(plain, spare=0.5)
     assert longer.max_detections == plain.max_detections
 
@@ -167,7 +166,13 @@ def test_padding_changes_nothing(ithor: SceneTables) -> None:
         _, seen = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 100))
         return jax.tree.leaves(seen)
 
-    for ours, theirs in zip(jax.jit(walk)(plain), jax.jit(walk)(longer), strict=True):
+    walked = jax.jit(walk)
+    for ours, theirs in zip(walked(plain), walked(longer), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    for ours, theirs in zip(walked(plain.replace(noise=None)), walked(more_rows), strict=True):
+        if ours.ndim > 1 and ours.shape != theirs.shape:  # rows of frames
+            assert not theirs[:, ours.shape[1] :].any()
+            theirs = theirs[:, : ours.shape[1]]
         np.testing.assert_array_equal(ours, theirs)
 
 
@@ -184,19 +189,32 @@ def test_nothing_hidden_is_in_further_pools(ithor: SceneTables) -> None:
     assert np.isin(rooms.row_class, hidden).any()
 
 
-def failing(task: Task) -> Task:
+@pytest.mark.parametrize("error", [SceneError("no room"), MemoryError("no memory")])
+def test_a_pool_that_cannot_be_built_loses_nothing(
+    task: Task, tmp_path: Path, error: Exception
+) -> None:
     def load(progress: Progress) -> None:
-        raise SceneError("no room to build")
+        raise error
 
-    return dataclasses.replace(task, further_pools=(load,))
-
-
-def test_a_pool_that_cannot_be_built_loses_nothing(task: Task, tmp_path: Path) -> None:
-    run = Run(tmp_path, TINY, failing(task))
-    with pytest.raises(SceneError, match="no room to build"):
+    run = Run(tmp_path, TINY, dataclasses.replace(task, further_pools=(load,)))
+    with pytest.raises(type(error), match="no "):
         list(run.chunks())
     assert len(read_metrics(tmp_path)) == 2
     assert run.checkpoints.latest() == 4
+
+
+def test_if_another_process_has_no_rooms_this_one_stops_as_well(
+    task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Run(tmp_path, TINY, task)
+    chunks = run.chunks()
+    assert next(chunks)
+    assert next(chunks)
+    monkeypatch.setattr(devices, "anywhere", lambda flag: True)
+    with pytest.raises(ValueError, match="another process could not build the next rooms"):
+        next(chunks)
+    assert run.checkpoints.latest() == 4
+    assert run.pools.entered == 0
 
 
 @pytest.fixture
@@ -224,6 +242,10 @@ class Watching(Callbacks):
         self.event, self.stop = event, stop
         self.told: list[tuple[float, int]] = []
         self.stopped = False
+        self.notes: list[str] = []
+
+    def on_note(self, text: str) -> None:
+        self.notes.append(text)
 
     def on_rooms(self, done: float, total: int) -> None:
         self.told.append((done, total))
@@ -249,8 +271,14 @@ def test_a_run_that_waits_for_rooms_says_so_and_can_be_stopped(
     workflow.train(TINY, tmp_path / "run", callbacks=watching)
     assert len(watching.told) >= 2
     assert {*watching.told} <= {(0.0, 1), (3.0, 10), (4.0, 10)}
+    assert watching.notes.count("waiting for the next pool of rooms ...") == 1
     assert watching.stopped == stop
     assert len(read_metrics(tmp_path / "run")) == (2 if stop else 8)
+    if stop:  # it waits again, and is stopped again
+        watching = Watching(slow, stop)
+        workflow.train(None, tmp_path / "run", resume=True, callbacks=watching)
+        assert watching.stopped
+        assert len(read_metrics(tmp_path / "run")) == 2
 
 
 def test_what_is_loaded_in_the_background_stops_when_the_run_does(
@@ -259,29 +287,33 @@ def test_what_is_loaded_in_the_background_stops_when_the_run_does(
     run = Run(tmp_path, TINY, waiting(task, slow))
     chunks = run.chunks()
     next(chunks)
-    assert run._pools._loading is not None
-    thread = run._pools._loading._thread
+    assert run.pools._loading is not None
+    thread = run.pools._loading._thread
     assert thread.is_alive()
     chunks.close()
     thread.join(10)
     assert not thread.is_alive()
 
 
+def pools_of(task: Task, config: TrainConfig = TINY) -> Pools:
+    return Pools(task, config, devices.everywhere(devices.first()))
+
+
 def test_turns_are_whole_chunks_and_one_pool_has_no_turns(task: Task) -> None:
     config = dataclasses.replace(TINY, pool_updates=5, chunk_updates=2)
-    assert [Pools(task, config).turn(updates) for updates in (0, 2, 4, 6, 8)] == [0, 0, 1, 1, 2]
+    assert [pools_of(task, config).turn(updates) for updates in (0, 2, 4, 6, 8)] == [0, 0, 1, 1, 2]
     config = dataclasses.replace(TINY, pool_updates=1, chunk_updates=10)
-    assert [Pools(task, config).turn(updates) for updates in (0, 10, 20)] == [0, 1, 2]
-    alone = dataclasses.replace(task, further_pools=())
-    assert Pools(alone, TINY).turn(1000) == 0
-    assert Pools(alone, TINY).params(0) is task.train_params
+    assert [pools_of(task, config).turn(updates) for updates in (0, 10, 20)] == [0, 1, 2]
+    alone = pools_of(dataclasses.replace(task, further_pools=()))
+    assert alone.turn(1000) == 0
+    chex.assert_trees_all_equal(alone.params, task.train_params)
 
 
 def test_keys_of_new_episodes_are_those_of_no_update(
     whole: tuple[Run, list[int], list[str], list[int]],
 ) -> None:
     run = whole[0]
-    model, params = run.model, run._params
+    model, params = run.model, run.pools.params
     again = learner.begin_again(run.state, TINY.learner, model, params)
     later = run.state.replace(updates=run.state.updates + 1)
     other = learner.begin_again(later, TINY.learner, model, params)
@@ -293,33 +325,52 @@ def test_keys_of_new_episodes_are_those_of_no_update(
     assert again.recurrent.is_first.all()
 
 
-@pytest.mark.slow
+def together(folder: Path, task: Task, config: TrainConfig = TINY) -> list[Run]:
+    """Two seeds that share their pools, new or continued."""
+    runs: list[Run] = []
+    for seed in (0, 1):
+        path = folder / str(seed)
+        path.mkdir(parents=True, exist_ok=True)
+        shared = runs[0].pools if runs else None
+        runs.append(Run(path, dataclasses.replace(config, seed=seed), task, pools=shared))
+    return runs
+
+
 def test_seeds_that_train_together_change_rooms_together(task: Task, tmp_path: Path) -> None:
-    runs = [
-        Run(tmp_path / str(seed), dataclasses.replace(TINY, seed=seed), task) for seed in (0, 1)
-    ]
-    for run in runs:
-        run.folder.mkdir()
+    runs = together(tmp_path, task, dataclasses.replace(TINY, steps=240))
     turns = [[run._turn for run in runs] for _ in chunks_together(runs)]
-    assert turns == [[k // 2] * 2 for k in range(8)]
-    # Interrupted and continued, they end where they would have ended.
-    others = [
-        Run(tmp_path / f"b{seed}", dataclasses.replace(TINY, seed=seed), task) for seed in (0, 1)
-    ]
-    for run in others:
-        run.folder.mkdir()
-    for count, _ in enumerate(chunks_together(others), start=1):
-        if count == 4:
+    assert turns == [[0, 0], [0, 0], [1, 1]]
+    assert not np.array_equal(*(run.state.env_state.pose for run in runs))
+
+
+def test_seeds_that_stop_stop_loading(task: Task, slow: threading.Event, tmp_path: Path) -> None:
+    runs = together(tmp_path, waiting(task, slow))
+    chunks = chunks_together(runs)
+    next(chunks)
+    assert runs[0].pools._loading is not None
+    thread = runs[0].pools._loading._thread
+    chunks.close()
+    assert not thread.is_alive()
+
+
+@pytest.mark.slow
+def test_seeds_that_train_together_go_on_bit_for_bit(task: Task, tmp_path: Path) -> None:
+    """One of them was interrupted before a change of rooms, and the other after it."""
+    whole = together(tmp_path / "whole", task)
+    list(chunks_together(whole))
+    begun = together(tmp_path / "begun", task)
+    for count, _ in enumerate(chunks_together(begun), start=1):
+        if count in (4, 5):
+            begun[count - 4].save()
+        if count == 6:
             break
-    for run in others:
-        run.save()
-    others = [
-        Run(tmp_path / f"b{seed}", dataclasses.replace(TINY, seed=seed), task) for seed in (0, 1)
-    ]
-    list(chunks_together(others))
-    for ours, theirs in zip(runs, others, strict=True):
+    begun = together(tmp_path / "begun", task)
+    widths = [len(rows) for rows in chunks_together(begun)]
+    assert widths == [1, 2, 2, 2]
+    for ours, theirs in zip(whole[1:], begun[1:], strict=True):
         for one, other in zip(leaves(ours), leaves(theirs), strict=True):
             np.testing.assert_array_equal(one, other)
+    assert [run._turn for run in begun] == [3, 3]
 
 
 def test_flags_of_pools_must_be_positive() -> None:

@@ -285,8 +285,10 @@ def of_validation(run: Path) -> Path:
 def test_runs_for_choosing_settings_stand_apart(of_validation: Path, tmp_path: Path) -> None:
     run, results = of_validation, tmp_path / "results"
     shutil.copytree(RESULTS / "18-4-random", results / "18-4-random")
-    with pytest.raises(ValueError, match=r"split 18/4-validation: validation/ has all runs with"):
+    with pytest.raises(ValueError, match=r"split 18/4-validation: call the row validation/NAME"):
         scoreboard.add(run, "mine", results)
+    with pytest.raises(ValueError, match="--name validation: is the folder of runs with"):
+        scoreboard.add(run, "validation", results)
     with pytest.raises(ValueError, match=r"--name validation/\.\./x: letters"):
         scoreboard.add(run, "validation/../x", results)
     out = scoreboard.add(run, "validation/rooms-generated-7", results)
@@ -297,7 +299,7 @@ def test_runs_for_choosing_settings_stand_apart(of_validation: Path, tmp_path: P
     edit(run / "config.json", seed=8)
     scoreboard.add(run, "validation/rooms-generated-8", results)
     edit(run / "results.json", split="18/4")
-    with pytest.raises(ValueError, match="split 18/4: validation/ has all runs with --validation"):
+    with pytest.raises(ValueError, match="split 18/4: call the row NAME"):
         scoreboard.add(run, "validation/test", results)
     rows = scoreboard.rows(results)
     assert [row.name for row in rows] == [
