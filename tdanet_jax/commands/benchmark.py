@@ -86,6 +86,8 @@ class Command:
     preset: Literal["default", "best", "robust", "paper"] = "default"
     """Preset that the `quality` part trains, on validation, until two evaluations in a row reach
     the paper's figures on split 18/4."""
+    num_envs: int | None = None
+    """Environments of the `quality` part, instead of the preset's."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the `quality` part, one run each."""
     most_steps: int = 6_000_000
@@ -107,6 +109,9 @@ class Command:
         chosen = dataclasses.replace(
             PRESETS[self.preset], episodes=None, steps=self.most_steps, validation=True
         )
+        if self.num_envs is not None:
+            learner = dataclasses.replace(chosen.learner, num_envs=self.num_envs)
+            chosen = dataclasses.replace(chosen, learner=learner)
         return [dataclasses.replace(chosen, seed=seed, data=self.data) for seed in self.seeds]
 
 

@@ -433,6 +433,7 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--preset": ("--parts quality", "--parts quality --preset best"),
             "--seeds": ("--parts quality", "--parts quality --seeds 8"),
             "--most-steps": ("--parts quality", "--parts quality --most-steps 8"),
+            "--num-envs": ("--parts quality", "--parts quality --num-envs 8"),
             "--repeats": "--repeats 8",
             "--out": ("--parts decision", "--parts decision --out new.jsonl"),
         },
