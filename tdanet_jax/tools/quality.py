@@ -13,8 +13,8 @@ from tdanet_jax.task import load_task
 from tdanet_jax.tools.benchmarking import Row, tdanet_forward_macs
 from tdanet_jax.training.run import Run
 
-#: Chunks of updates from one evaluation to the next.
-CHUNKS = 2
+#: Steps from one evaluation to the next, rounded to whole chunks of updates.
+STEPS = 100_000
 #: Evaluations in a row that must pass, so that a lucky one does not count.
 IN_A_ROW = 2
 #: Random numbers of the sampled actions, the same in every evaluation.
@@ -65,7 +65,7 @@ def until_passed(evaluations: Iterable[tuple[Bar, Row]], bar: Bar) -> tuple[bool
 def quality_row(config: TrainConfig) -> Row:
     """Trains until `IN_A_ROW` evaluations in a row pass the paper's figures, or out of budget.
 
-    Every `CHUNKS` chunks, all episodes of the split's lists are played with sampled actions.
+    Every `STEPS` steps, all episodes of the split's lists are played with sampled actions.
 
     Args:
       config: what is trained. With `validation`, other rooms and classes are evaluated than those
@@ -83,8 +83,9 @@ def quality_row(config: TrainConfig) -> Row:
 
     def evaluated(run: Run) -> Iterator[tuple[Bar, Row]]:
         nonlocal evaluating
+        every = max(1, round(STEPS / (config.chunk_updates * config.steps_per_update)))
         for number, _ in enumerate(run.chunks(), start=1):
-            if number % CHUNKS == 0 or run.progress >= 1:
+            if number % every == 0 or run.progress >= 1:
                 paused = time.perf_counter()
                 played = rollout.evaluate_lists(
                     policy, run.state.params, task.eval_params, lists, SEED

@@ -100,13 +100,17 @@ def of_rows(rows: Iterable[Row]) -> list[str]:
 
 
 def of_agents(rows: Iterable[Row]) -> list[str]:
-    """A table of the agents of rows, in their order: SR and SPL of all and of long episodes."""
-    agents = _by_agent(rows)
+    """A table of the agents of rows, in their order: SR and SPL of all episodes."""
     shown = [
-        (_of_agent(agent, seeds), comparison.summary([row.results for row in seeds]))
-        for agent, seeds in agents.items()
+        (_without_senses(_of_agent(agent, seeds)), comparison.summary([r.results for r in seeds]))
+        for agent, seeds in _by_agent(rows).items()
     ]
-    return ["", *comparison.table(_HEADS, shown, measures=comparison.MEASURES), ""]
+    heads, measures = _without_senses(_HEADS), comparison.MEASURES
+    return ["", *comparison.table(heads, shown, buckets=("L>=1",), measures=measures), ""]
+
+
+def _without_senses(cells: Sequence[str]) -> Sequence[str]:
+    return (cells[0], *cells[2:])
 
 
 def _by_agent(rows: Iterable[Row]) -> dict[str, list[Row]]:

@@ -313,7 +313,9 @@ def test_runs_for_choosing_settings_stand_apart(of_validation: Path, tmp_path: P
     flags = "--preset robust --steps 3000000 --validation --generated 1000 --generated-only"
     (line,) = (line for line in text.splitlines() if "--generated" in line)
     assert line.startswith(f"| <code>tdanet {flags}")
-    assert "| 7, 8 | 12.0 M | 6.00 | 91.6 ± 0.0 |" in line
+    assert line.endswith(
+        "| 7, 8 | 12.0 M | 6.00 | 91.6 ± 0.0 | 51.6 ± 0.0 | 87.0 ± 0.0 | 54.2 ± 0.0 |"
+    )
     with pytest.raises(ValueError, match=r"no row validation/no-\*"):
         scoreboard_page.filled(
             Path("page.md"), "<!-- scoreboard: validation/no-* -->\n<!-- end -->\n", rows
