@@ -88,6 +88,9 @@ class Command:
     the paper's figures on split 18/4."""
     num_envs: int | None = None
     """Environments of the `quality` part, instead of the preset's."""
+    units: int | None = None
+    """Units of each layer of the encoder and of the LSTM in the `quality` part, instead of the
+    preset's."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the `quality` part, one run each."""
     most_steps: int = 6_000_000
@@ -109,9 +112,12 @@ class Command:
         chosen = dataclasses.replace(
             PRESETS[self.preset], episodes=None, steps=self.most_steps, validation=True
         )
+        learner, network = chosen.learner, chosen.network
         if self.num_envs is not None:
-            learner = dataclasses.replace(chosen.learner, num_envs=self.num_envs)
-            chosen = dataclasses.replace(chosen, learner=learner)
+            learner = dataclasses.replace(learner, num_envs=self.num_envs)
+        if self.units is not None:
+            network = dataclasses.replace(network, width=self.units, hidden=self.units)
+        chosen = dataclasses.replace(chosen, learner=learner, network=network)
         return [dataclasses.replace(chosen, seed=seed, data=self.data) for seed in self.seeds]
 
 
@@ -128,6 +134,8 @@ def main(arguments: list[str] | None = None) -> None:
             batches=command.batches,
             networks=command.networks,
             most_steps=command.most_steps,
+            num_envs=1 if command.num_envs is None else command.num_envs,
+            units=1 if command.units is None else command.units,
         )
         for config in command.trained():
             config.check()

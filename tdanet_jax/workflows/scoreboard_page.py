@@ -2,7 +2,7 @@
 
 A block begins with `<!-- scoreboard: ... -->` and ends with `<!-- end -->`, each on a line of its
 own. If it names a split, it is that split's part of the scoreboard; if it names rows, a table of
-these; if it is a pattern, such as validation/rooms-*, a table of the agents of these rows.
+these; if one of them is a pattern, such as validation/rooms-*, a table of the agents of these rows.
 """
 
 from __future__ import annotations
@@ -60,16 +60,19 @@ def filled(path: Path, text: str, rows: Sequence[Row]) -> str:
     """
     by_name = {row.name: row for row in rows}
 
+    def named(pattern: str) -> list[Row]:
+        found = [row for row in rows if fnmatch.fnmatchcase(row.name, pattern)]
+        if not found:
+            raise FileError(path, f"scoreboard: no row {pattern}")
+        return found
+
     def fill(block: re.Match[str]) -> str:
         if MARK in block[2]:
             raise FileError(path, f"{MARK}{block[1]} --> has no <!-- end -->")
         if block[1] in NAMED:
             lines = of_split(block[1], rows)
         elif "*" in block[1]:
-            chosen = [row for row in rows if fnmatch.fnmatchcase(row.name, block[1])]
-            if not chosen:
-                raise FileError(path, f"scoreboard: no row {block[1]}")
-            lines = of_agents(chosen)
+            lines = of_agents([row for name in block[1].split() for row in named(name)])
         else:
             if unknown := [name for name in block[1].split() if name not in by_name]:
                 raise FileError(path, f"scoreboard: no row {', '.join(unknown)}")

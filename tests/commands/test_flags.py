@@ -434,6 +434,7 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--seeds": ("--parts quality", "--parts quality --seeds 8"),
             "--most-steps": ("--parts quality", "--parts quality --most-steps 8"),
             "--num-envs": ("--parts quality", "--parts quality --num-envs 8"),
+            "--units": ("--parts quality", "--parts quality --units 8"),
             "--repeats": "--repeats 8",
             "--out": ("--parts decision", "--parts decision --out new.jsonl"),
         },

@@ -316,6 +316,10 @@ def test_runs_for_choosing_settings_stand_apart(of_validation: Path, tmp_path: P
     assert line.endswith(
         "| 7, 8 | 12.0 M | 6.00 | 91.6 ± 0.0 | 51.6 ± 0.0 | 87.0 ± 0.0 | 54.2 ± 0.0 |"
     )
+    both = "<!-- scoreboard: validation/rooms-* 18-4-random -->\n<!-- end -->\n"
+    lines = scoreboard_page.filled(Path("page.md"), both, rows).splitlines()
+    agents = [line.split(" |")[0] for line in lines if line.startswith("| <code>")]
+    assert agents == [f"| <code>tdanet {flags}</code>", "| <code>random</code>"]
     with pytest.raises(ValueError, match=r"no row validation/no-\*"):
         scoreboard_page.filled(
             Path("page.md"), "<!-- scoreboard: validation/no-* -->\n<!-- end -->\n", rows
