@@ -102,7 +102,7 @@ def test_frames_are_those_of_the_definition(seed: int, count: int) -> None:
     levels = random_levels(rng)
     bits = rng.integers(0, 65536, (8, K + EXTRA + 1))
     found = detect(*frame_of(seen), jnp.asarray(bits, jnp.uint16), episode(levels))
-    known = np.asarray(PARAMS.known).tolist()
+    known = np.asarray(PARAMS.known)[: int(PARAMS.known_count)].tolist()
     expected = noise_oracle.detect(
         seen, K, TABLE, bits.tolist(), levels, known, np.asarray(PARAMS.similar).tolist()
     )

@@ -67,7 +67,7 @@ FAULTS = (
     Fault("pools of rooms never change", "training/pools.py",
           "updates // self._updates if self._count > 1 else 0", "0", "training/test_pools.py"),
     Fault("episodes go on in other rooms", "training/run.py",
-          "            self._turn = turn\n            self._begin_again()", "            self._turn = turn",
+          "self.state = self._begin_again(self.state, self.pools.params)", "pass",
           "training/test_pools.py"),
     Fault("variants ignore the seed", "scenes/vary.py", "default_rng([seed, copy,",
           "default_rng([copy,", "scenes/test_vary.py"),

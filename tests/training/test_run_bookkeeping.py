@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,6 +33,8 @@ CONFIG = TrainConfig(
 NOT_KEPT = {
     "checkpoints": "an open folder",
     "_journal": "an open file; its rows are compared",
+    "pools": "those of the task; their tables are compared",
+    "_begin_again": "a function",
     "_skipped_before": "counts from each start; compared below",
 }
 
@@ -46,7 +49,7 @@ def begins_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A new run has made-up arrays: nothing is compiled, and no two leaves agree."""
 
     def begin(run: Run) -> TrainState:
-        shapes = jax.eval_shape(run._init, jax.random.key(0), run._words, run._params)
+        shapes = jax.eval_shape(run._init, jax.random.key(0), run._words, run.pools.params)
         leaves, tree = jax.tree.flatten(shapes.replace(key=jnp.zeros(2, jnp.uint32)))
         made = [jnp.full(x.shape, 1 + i % 100, x.dtype) for i, x in enumerate(leaves)]
         state: TrainState = jax.tree.unflatten(tree, made)
@@ -83,6 +86,7 @@ def test_every_attribute_is_as_it_was(task: Task, tmp_path: Path) -> None:
         if name not in NOT_KEPT:
             assert plain(getattr(again, name)) == plain(value), name
     assert again._skipped_before == 5
+    chex.assert_trees_all_equal(again.pools.params, run.pools.params)
     for name in ("title", "steps", "progress"):
         assert getattr(again, name) == getattr(run, name)
     assert plain(again._shares()) == plain(run._shares())
