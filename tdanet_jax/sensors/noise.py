@@ -79,9 +79,7 @@ class NoiseParams(struct.PyTreeNode):
     low: jax.Array  # [17] float32, least levels of an episode, in the order of `NoiseLevels`
     high: jax.Array  # [17] float32, greatest levels
     corners: jax.Array  # [N + K, 4] float32, x1, y1, x2, y2 of each detection's extent
-    known: (
-        jax.Array
-    )  # [C] int32, ascending: the A classes that are detected anywhere, then the last
+    known: jax.Array  # [C] int32, ascending: the A classes that are detected, the last repeated
     known_count: jax.Array  # [] int32, A
     similar: jax.Array  # [C, SIMILAR] int32, what a class is confused with
     rows: jax.Array  # [] int32, N, detections in the tables

@@ -21,7 +21,7 @@ SPARE = 0.05
 
 
 class Pools:
-    """The pools of rooms of a run, or of several seeds that train together.
+    """The pools of rooms that a run trains in, or several seeds that train together.
 
     Pools take turns, numbered from 0. `params` is the environment of turn `entered`.
     """
