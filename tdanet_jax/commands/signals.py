@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 import threading
@@ -13,8 +14,11 @@ from typing import Any, NoReturn
 
 from tdanet_jax import commands
 
-#: Seconds after which a stop that waits for an import, or was dropped, is raised again.
+#: Seconds after which a stop that waits for a library, or was dropped, is raised again.
 RETRY_SECONDS = 0.05
+#: Files whose functions must not be interrupted: the import system, and JAX's start of a backend,
+#: which would leave a thread behind for which the program then waits at its end.
+STARTING = ("<frozen importlib._bootstrap>", os.path.join("jax", "_src", "xla_bridge.py"))
 
 
 class Stopped(KeyboardInterrupt):
@@ -42,7 +46,8 @@ class Stopped(KeyboardInterrupt):
 class StopRequest:
     """Raises `Stopped` on SIGTERM and Ctrl-C: at once, or at the end of `deferred`.
 
-    During an import the first signal waits: a library whose import is interrupted may crash.
+    While a library is imported, or JAX starts a device, the first signal waits: the library may
+    crash or hang if that is interrupted.
 
     Attributes:
       signal: number of the first signal, until it is answered.
@@ -51,7 +56,7 @@ class StopRequest:
     def __init__(self) -> None:
         self.signal: int | None = None
         self._deferring = False
-        self._imports = 0  # depth of imports when we began to receive
+        self._starts = 0  # of libraries that were under way when we began to receive
         self._alarm: Any = None  # the handler of SIGALRM before ours
         self._asked = False  # whether the timer is ours
 
@@ -76,7 +81,7 @@ class StopRequest:
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        self._imports = _imports(sys._getframe())
+        self._starts = _starts(sys._getframe())
         self._alarm = signal.getsignal(signal.SIGALRM)
         before = {
             number: signal.signal(number, self._receive)
@@ -116,7 +121,7 @@ class StopRequest:
         """Raises `Stopped`, now or later."""
         if self._deferring:
             return
-        if _imports(frame) > self._imports:
+        if _starts(frame) > self._starts:
             self.ask_again()
         else:
             self._check()
@@ -132,7 +137,6 @@ class StopRequest:
             signal.setitimer(signal.ITIMER_REAL, RETRY_SECONDS)
 
 
-def _imports(frame: FrameType | None) -> int:
-    """How many calls of the import system are on a frame's stack."""
-    stack = traceback.walk_stack(frame)
-    return sum(f.f_code.co_filename == "<frozen importlib._bootstrap>" for f, _ in stack)
+def _starts(frame: FrameType | None) -> int:
+    """How many calls that import or start a library are on a frame's stack."""
+    return sum(f.f_code.co_filename.endswith(STARTING) for f, _ in traceback.walk_stack(frame))

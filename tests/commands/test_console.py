@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from jax._src import xla_bridge
 
 from tdanet_jax.commands import console, evaluate, running
 
@@ -142,6 +143,21 @@ def test_a_signal_waits_for_an_import_but_a_second_one_does_not(
     assert capsys.readouterr() == ("once\n", "stopped\n")
     assert status(lambda: module(text + "strike()\nprint('twice')")) == 128 + signal.SIGTERM
     assert capsys.readouterr() == ("once\n", "stopped\n")
+
+
+def test_a_signal_waits_until_jax_has_started_a_device(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def make(*_: object) -> None:
+        strike()
+        time.sleep(0.2)
+        print("started")
+
+    monkeypatch.setattr(xla_bridge, "make_tpu_client", make)
+    # The function starts a thread that the program waits for, unless it is left in good order.
+    assert status(lambda: xla_bridge.tpu_client_timer_callback(60.0)) == 128 + signal.SIGTERM
+    assert capsys.readouterr() == ("started\n", "stopped\n")
+    assert not any(isinstance(thread, threading.Timer) for thread in threading.enumerate())
 
 
 def test_a_command_that_an_imported_script_calls_is_stopped(
