@@ -52,6 +52,7 @@ def test_loops_and_other_programs_are_left_out():
     assert profiling.sort(durations, places) == {"products": 7, "optimizer": 2}
 
 
+@pytest.mark.slow
 def test_an_update_has_all_parts(some_rooms, glove):
     row = profiling.profile_row(make_task(TINY, some_rooms, glove), 4)
     assert sum(row[part] for part in profiling.PARTS) == pytest.approx(1, abs=0.01)

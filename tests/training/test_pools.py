@@ -108,7 +108,7 @@ def test_pools_take_turns_and_only_those_that_the_budget_reaches_are_loaded(
 
 
 @pytest.mark.parametrize(
-    "stop", [2, 3, *(pytest.param(stop, marks=pytest.mark.slow) for stop in (1, 4, 6))]
+    "stop", [2, *(pytest.param(stop, marks=pytest.mark.slow) for stop in (1, 3, 4, 6))]
 )
 def test_a_run_goes_on_bit_for_bit_in_the_rooms_that_it_was_in(
     whole: tuple[Run, list[int], list[str], list[int]], task: Task, tmp_path: Path, stop: int
@@ -334,6 +334,7 @@ def together(folder: Path, task: Task, config: TrainConfig = TINY) -> list[Run]:
     return runs
 
 
+@pytest.mark.slow
 def test_seeds_that_train_together_change_rooms_together(task: Task, tmp_path: Path) -> None:
     runs = together(tmp_path, task, dataclasses.replace(TINY, steps=240))
     turns = [[run._turn for run in runs] for _ in chunks_together(runs)]
@@ -341,6 +342,7 @@ def test_seeds_that_train_together_change_rooms_together(task: Task, tmp_path: P
     assert not np.array_equal(*(run.state.env_state.pose for run in runs))
 
 
+@pytest.mark.slow
 def test_seeds_that_stop_stop_loading(task: Task, slow: threading.Event, tmp_path: Path) -> None:
     runs = together(tmp_path, waiting(task, slow))
     chunks = chunks_together(runs)
