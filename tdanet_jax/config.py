@@ -41,7 +41,7 @@ TRUST = "TDANET_TRUST"
 class LearnerConfig:
     """The update's hyperparameters; `--preset paper` has those of the reference implementation."""
 
-    num_envs: int = 256
+    num_envs: int = 64
     """Environments that step together (B)."""
     rollout_steps: int = 20
     """Actions per environment and update (T)."""
@@ -470,6 +470,7 @@ def _fits(value: Any, kind: Any) -> bool:
 PAPER = TrainConfig(
     episodes=6_000_000,
     learner=LearnerConfig(
+        num_envs=256,
         learning_rate=1e-4,
         final_learning_rate=1e-4,
         amsgrad=True,

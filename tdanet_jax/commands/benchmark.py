@@ -63,7 +63,7 @@ class Command:
     """What to measure; `quality`, which trains for minutes, only if it is named."""
     environments: tuple[int, ...] = (1024, 4096, 16384)
     """Numbers of environments in the `environment` part."""
-    batches: tuple[int, ...] = (256, 512, 1024)
+    batches: tuple[int, ...] = (64, 256, 1024)
     """Numbers of environments in the `rollout`, `update` and `profile` parts."""
     precisions: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
     """Precision of the matrix products in these parts."""

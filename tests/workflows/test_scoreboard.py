@@ -15,7 +15,7 @@ import pytest
 from matplotlib.image import imread
 
 from tdanet_jax.analysis import figures
-from tdanet_jax.config import BEST, PRESETS
+from tdanet_jax.config import BEST, PRESETS, ROBUST, to_json
 from tdanet_jax.tools import scoreboard as tool
 from tdanet_jax.training import run_file
 from tdanet_jax.training.run_file import Process
@@ -101,7 +101,8 @@ def run(tmp_path: Path) -> Path:
     folder = tmp_path / "run"
     shutil.copytree(RESULTS / "18-4-robust-0", folder)
     edit(folder / "results.json", seed=7, evaluation_seed=7)
-    edit(folder / "config.json", seed=7, word_vectors="/home/me/w.txt")
+    learner = to_json(ROBUST)["learner"]  # the row's has another number of environments
+    edit(folder / "config.json", seed=7, word_vectors="/home/me/w.txt", learner=learner)
     metrics = [
         {"updates": n, "steps": n * 10**6, "episodes": n, "seconds": 1800.0 * n,
          "success": n / 12, "spl": None if n == 1 else n / 24}
@@ -366,7 +367,7 @@ def test_rooms_and_what_they_give_are_drawn(
 
 def test_an_agent_is_called_by_its_flags() -> None:
     row, paper = scoreboard.read(RESULTS / "18-4-best-0"), PRESETS["paper"]
-    assert row.agent == "tdanet --preset best"
+    assert row.agent == "tdanet --preset best --num-envs 256"
     network = dataclasses.replace(BEST.network, triangulation=False)
     for config, agent in (
         (dataclasses.replace(BEST, network=network), "tdanet --preset best --no-triangulation"),
