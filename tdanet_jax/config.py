@@ -45,6 +45,13 @@ class LearnerConfig:
     """Environments that step together (B)."""
     rollout_steps: int = 20
     """Actions per environment and update (T)."""
+    num_minibatches: int = 1
+    """Optimiser steps in which a rollout is learnt from (PPO), each from an equal share of the
+    environments. For GPUs, which need more environments than are good to learn from at once."""
+    update_epochs: int = 1
+    """Times that a rollout is learnt from (PPO)."""
+    clip_coef: float = 0.2
+    """PPO's clip of the ratio of probabilities; no effect if a rollout is one optimiser step."""
     learning_rate: float = 5e-4
     """Adam's initial learning rate."""
     final_learning_rate: float = 0.0
@@ -80,6 +87,11 @@ class LearnerConfig:
     bootstrap_truncated: bool = True
     """Bootstrap the return from the last state's value when an episode times out. False treats a
     time-out as termination, as the reference does."""
+
+    @property
+    def optimizer_steps(self) -> int:
+        """Optimiser steps in an update; with several, its loss is PPO's."""
+        return self.num_minibatches * self.update_epochs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,6 +236,9 @@ class TrainConfig:
             for name in names:
                 if values[name] is not None and not holds(values[name]):
                     raise ValueError(f"--{name.replace('_', '-')} {values[name]}: must {wanted}")
+        count, parts = self.learner.num_envs, self.learner.num_minibatches
+        if count % parts:
+            raise ValueError(f"--num-minibatches {parts}: must divide --num-envs {count}")
         if self.network.image == "features" and self.data is None:
             raise ValueError("--image features: needs --data, rooms that were imported with them")
         if self.generated_only and not self.generated:
@@ -405,7 +420,8 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
         (
             "steps", "episodes", "minutes", "pool_rooms", "pool_updates", "chunk_updates",
             "checkpoint_minutes", "max_skipped",
-            "num_envs", "rollout_steps", "step_limit", "learning_rate", "adam_epsilon",
+            "num_envs", "rollout_steps", "num_minibatches", "update_epochs", "clip_coef",
+            "step_limit", "learning_rate", "adam_epsilon",
             "max_grad_norm", "width", "hidden", "word_norm", "inner_rate",
         ),
         lambda value: value > 0,
@@ -426,8 +442,8 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     ),
     (
         (
-            "num_envs", "rollout_steps", "step_limit", "pool_rooms", "pool_updates",
-            "chunk_updates", "history",
+            "num_envs", "rollout_steps", "num_minibatches", "update_epochs", "step_limit",
+            "pool_rooms", "pool_updates", "chunk_updates", "history",
         ),
         lambda value: value <= 1_000_000,
         "be at most 1,000,000",

@@ -51,6 +51,12 @@ def test_paper_preset_has_the_reference_constants():
         (TrainConfig(learner=LearnerConfig(step_limit=2**40)), "--step-limit 1099511627776"),
         (TrainConfig(learner=LearnerConfig(learning_rate=10**400)), "--learning-rate 1000"),
         (TrainConfig(learner=LearnerConfig(num_envs=0)), "--num-envs 0"),
+        (TrainConfig(learner=LearnerConfig(num_minibatches=0)), "--num-minibatches 0"),
+        (
+            TrainConfig(learner=LearnerConfig(num_envs=10, num_minibatches=4)),
+            "--num-minibatches 4: must divide --num-envs 10",
+        ),
+        (TrainConfig(learner=LearnerConfig(clip_coef=0.0)), "--clip-coef 0.0"),
         (TrainConfig(learner=LearnerConfig(gamma=1.5)), "--gamma 1.5"),
         (TrainConfig(network=NetworkConfig(dropout=1.0)), "--dropout 1.0"),
         (TrainConfig(learner=LearnerConfig(learning_rate=float("nan"))), "--learning-rate nan"),

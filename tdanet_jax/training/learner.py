@@ -1,14 +1,18 @@
 """Synchronous advantage actor-critic (Mnih et al. 2016, without the asynchrony) in one scan.
 
 File order is execution order: `init` makes the state, `rollout` acts for T steps in B
-environments, `loss` looks back at them, `update` does both and takes one optimiser step, and
-`make_train` compiles many updates into one call.
+environments, `loss` looks back at them, `learn` takes an optimiser step, `update` does all of
+this, and `make_train` compiles many updates into one call.
+
+A rollout is one optimiser step, or several, of which each learns from some of the environments:
+then the loss is that of PPO (Schulman et al. 2017).
 
 Axis letters: T steps of a rollout, B environments, H units, K detections, C classes.
 """
 
 from __future__ import annotations
 
+import functools
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -52,7 +56,7 @@ class Rollout(NamedTuple):
     prev_action_probs: jax.Array
     is_first: jax.Array
     dropout_mask: jax.Array | None
-    activations: Any
+    activations: Any  # of the network that acted; empty if another one will look back, too
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array
@@ -63,6 +67,14 @@ class Rollout(NamedTuple):
     success: jax.Array
     length: jax.Array
     shortest: jax.Array
+
+
+class Experience(NamedTuple):
+    """What an optimiser step learns from."""
+
+    steps: Rollout
+    advantage: jax.Array  # [T, B]
+    carry: Any  # of the network before the first step, [B, ...]
 
 
 def make_optimizer(config: LearnerConfig) -> optax.GradientTransformation:
@@ -144,13 +156,15 @@ def rollout(
     class_table = actor_critic.prepare(model, state.params, words)
     rate = model.encoder.dropout
     batch, units = config.num_envs, model.encoder.dropout_units
+    # After an optimiser step, the activations are no longer those of the network.
+    collections = (ACTIVATIONS,) if config.optimizer_steps == 1 else ()
 
     def act(state: TrainState, step_key: jax.Array) -> tuple[TrainState, Rollout]:
         action_key, dropout_key, reset_key = jax.random.split(step_key, 3)
         obs = observe(state.env_state, params)
         mask = _dropout_mask(dropout_key, rate, (batch, units)) if rate else None
         recurrent, out, kept = actor_critic.act(
-            model, weights, class_table, state.recurrent, obs, mask, collections=(ACTIVATIONS,)
+            model, weights, class_table, state.recurrent, obs, mask, collections=collections
         )
         log_probs = jax.nn.log_softmax(out.logits)
         action = jax.random.categorical(action_key, out.logits)
@@ -199,18 +213,18 @@ def _dropout_mask(key: jax.Array, rate: float, shape: tuple[int, ...]) -> jax.Ar
 
 def loss(
     weights: Any,
-    steps: Rollout,
-    advantage: jax.Array,
-    carry: Any,
+    experience: Experience,
     entropy_weight: jax.Array,
     config: LearnerConfig,
     model: ActorCritic,
     words: jax.Array,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """The actor-critic loss of a rollout, and its parts.
+    """The loss of a rollout, and its parts.
 
-    The network's values are those recorded while acting; only the gradients are new work.
+    If the network is still the one that acted, its values are those recorded while acting; only
+    the gradients are new work.
     """
+    steps, advantage, carry = experience
     class_table = actor_critic.prepare(model, weights, words)
     inputs = (steps.obs, steps.prev_action_probs, steps.is_first, steps.dropout_mask)
     _, out = actor_critic.forward(
@@ -225,11 +239,71 @@ def loss(
     log_probs = jax.nn.log_softmax(out.logits)
     log_prob = jnp.take_along_axis(log_probs, steps.action[..., None], -1)[..., 0]
     entropy = mean(-jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1))
-    policy_loss = -mean(log_prob * advantage)
+    if config.optimizer_steps == 1:
+        policy_loss = -mean(log_prob * advantage)
+    else:
+        ratio = jnp.exp(log_prob - steps.log_prob)
+        clipped = jnp.clip(ratio, 1.0 - config.clip_coef, 1.0 + config.clip_coef)
+        policy_loss = -mean(jnp.minimum(ratio * advantage, clipped * advantage))
     value_loss = mean(0.5 * (steps.value + advantage - out.value) ** 2)
     total = policy_loss + config.value_weight * value_loss - entropy_weight * entropy
     parts = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
     return total, parts
+
+
+def minibatches(experience: Experience, count: int) -> Experience:
+    """`count` parts with a leading axis: part i has the environments i, i + count, ...
+
+    Environments are alike, so they need not be drawn; and if they are divided between devices, so
+    is every part.
+    """
+
+    def split(x: jax.Array, axis: int) -> jax.Array:
+        shape = (*x.shape[:axis], x.shape[axis] // count, count, *x.shape[axis + 1 :])
+        return jnp.moveaxis(x.reshape(shape), axis + 1, 0)
+
+    steps, advantage, carry = experience
+    return Experience(
+        *jax.tree.map(lambda x: split(x, 1), (steps, advantage)),
+        jax.tree.map(lambda x: split(x, 0), carry),
+    )
+
+
+def learn(
+    weights: Any,
+    opt_state: optax.OptState,
+    experience: Experience,
+    rate: jax.Array,
+    entropy_weight: jax.Array,
+    config: LearnerConfig,
+    model: ActorCritic,
+    words: jax.Array,
+) -> tuple[Any, optax.OptState, dict[str, jax.Array]]:
+    """One optimiser step.
+
+    Args:
+      weights: the network's parameters.
+      opt_state: the optimiser's state.
+      experience: what to learn from.
+      rate: the learning rate.
+      entropy_weight: of the loss.
+
+    Returns:
+      Parameters and the optimiser's state after it, and means to log. `skipped` is 1 if the loss or
+      the gradient was not finite: then nothing has changed.
+    """
+    (total, parts), grads = jax.value_and_grad(loss, has_aux=True)(
+        weights, experience, entropy_weight, config, model, words
+    )
+    with jax.named_scope("optimizer"):
+        grad_norm = optax.tree.norm(grads)
+        finite = jnp.isfinite(total) & jnp.isfinite(grad_norm)
+        scaled, moved = make_optimizer(config).update(grads, opt_state, weights)
+        stepped = jax.tree.map(lambda p, g: p - rate * g, weights, scaled)
+        weights, opt_state = jax.tree.map(
+            lambda new, old: jnp.where(finite, new, old), (stepped, moved), (weights, opt_state)
+        )
+    return weights, opt_state, {**parts, "grad_norm": grad_norm, "skipped": 1 - finite}
 
 
 def update(
@@ -240,7 +314,7 @@ def update(
     words: jax.Array,
     params: EnvParams,
 ) -> tuple[TrainState, dict[str, jax.Array]]:
-    """One rollout and one optimiser step.
+    """One rollout and its optimiser steps.
 
     Args:
       state: the run.
@@ -259,33 +333,35 @@ def update(
     def mix(start: float, end: float) -> jax.Array:
         return start + (end - start) * jnp.clip(progress, 0.0, 1.0)
 
-    entropy_weight = mix(config.entropy_weight, config.final_entropy_weight)
-    (total, parts), grads = jax.value_and_grad(loss, has_aux=True)(
-        state.params, steps, advantage, state.recurrent.carry, entropy_weight, config, model, words
-    )
     rate = mix(config.learning_rate, config.final_learning_rate)
-    with jax.named_scope("optimizer"):
-        grad_norm = optax.tree.norm(grads)
-        finite = jnp.isfinite(total) & jnp.isfinite(grad_norm)
-        scaled, opt_state = make_optimizer(config).update(grads, state.opt_state, state.params)
-        weights = jax.tree.map(lambda p, g: p - rate * g, state.params, scaled)
-        # A non-finite loss or gradient must not reach the parameters: the update is skipped.
-        weights, opt_state = jax.tree.map(
-            lambda new, old: jnp.where(finite, new, old),
-            (weights, opt_state),
-            (state.params, state.opt_state),
-        )
+    entropy_weight = mix(config.entropy_weight, config.final_entropy_weight)
+    experience = Experience(steps, advantage, state.recurrent.carry)
+    learning = functools.partial(
+        learn, rate=rate, entropy_weight=entropy_weight, config=config, model=model, words=words
+    )
+    if config.optimizer_steps == 1:
+        weights, opt_state, metrics = learning(state.params, state.opt_state, experience)
+    else:
+        parts = minibatches(experience, config.num_minibatches)
+
+        def body(learnt: tuple[Any, Any], index: jax.Array) -> tuple[tuple[Any, Any], Any]:
+            part = jax.tree.map(lambda x: x[index], parts)
+            weights, opt_state, metrics = learning(*learnt, part)
+            return (weights, opt_state), metrics
+
+        order = jnp.arange(config.optimizer_steps) % config.num_minibatches
+        (weights, opt_state), metrics = jax.lax.scan(body, (state.params, state.opt_state), order)
+        metrics = {n: x.max() if n == "skipped" else x.mean() for n, x in metrics.items()}
+    skipped = metrics.pop("skipped")
     after = after.replace(
         params=weights,
         opt_state=opt_state,
         updates=state.updates + 1,
         episodes=state.episodes + steps.done.sum(),
-        skipped=state.skipped + ~finite,
+        skipped=state.skipped + skipped,
     )
-    metrics = {
-        **parts,
+    metrics |= {
         "explained_variance": _explained_variance(steps, advantage),
-        "grad_norm": grad_norm,
         "learning_rate": rate,
     }
     return after, metrics | _episode_sums(steps)

@@ -584,6 +584,11 @@ def test_every_flag_has_a_row() -> None:
 SHOWN = {
     "num_envs": "system/test_random_keys.py::test_no_key_repeats_in_a_run_of_two_updates",
     "rollout_steps": "system/test_random_keys.py::test_no_key_repeats_in_a_run_of_two_updates",
+    **dict.fromkeys(
+        ("num_minibatches", "update_epochs", "clip_coef"),
+        "training/test_learner.py::test_several_optimiser_steps_are_ppo_on_every_so_manieth"
+        "_environment",
+    ),
     "amsgrad": "training/test_learner.py::test_an_update_is_one_step_of_clipped_adam_on_the"
     "_gradient_of_the_loss",
     "bootstrap_truncated": "training/test_learner.py::test_rollouts_follow_the_slow_world_and_value"

@@ -17,14 +17,14 @@ from tdanet_jax.workflows import train as training
 
 #: In a process of its own, which alone can split its CPU into eight devices.
 EIGHT = """
-import dataclasses, jax, numpy as np
+import dataclasses, sys, jax, numpy as np
 from tdanet_jax.training import devices
 mesh = devices.connect(8)
 from jax.sharding import Mesh
 from tdanet_jax.training import learner
 from tests.training.test_learner import CONFIG, MODEL, PARAMS, WORDS
 
-config = dataclasses.replace(CONFIG, num_envs=24)
+config = dataclasses.replace(CONFIG, num_envs=24, num_minibatches=int(sys.argv[1]))
 init = jax.jit(lambda key: learner.init(key, config, MODEL, WORDS, PARAMS))
 ends = []
 for over in (Mesh(np.array(jax.devices()[:1]), (devices.AXIS,)), mesh):
@@ -56,8 +56,10 @@ print("equal")
 
 
 @pytest.mark.slow
-def test_an_update_on_eight_devices_is_the_update_on_one():
-    done = subprocess.run([sys.executable, "-c", EIGHT], capture_output=True, text=True)
+@pytest.mark.parametrize("minibatches", ["1", "3"])
+def test_an_update_on_eight_devices_is_the_update_on_one(minibatches):
+    command = [sys.executable, "-c", EIGHT, minibatches]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.stdout == "equal\n", done.stderr
 
 

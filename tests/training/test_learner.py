@@ -228,8 +228,8 @@ def gradient(
     """Loss, its parts and its gradient for the parameters that acted."""
 
     def total(params: Any) -> Any:
-        arguments = (steps, advantage, state.recurrent.carry, entropy, CONFIG, model, WORDS)
-        return learner.loss(params, *arguments)
+        experience = learner.Experience(steps, advantage, state.recurrent.carry)
+        return learner.loss(params, experience, entropy, CONFIG, model, WORDS)
 
     return jax.value_and_grad(total, has_aux=True)(state.params)
 
@@ -396,6 +396,87 @@ def test_an_update_is_one_step_of_clipped_adam_on_the_gradient_of_the_loss(
         assert int(state.updates) == number + 1
         # Adam divides by the gradient's own size: where that is tiny, its rounding shows.
         chex.assert_trees_all_close(state.params, expected, rtol=1e-4, atol=2e-5)
+
+
+@functools.partial(jax.jit, static_argnames=("clip",))
+def ppo(
+    params: Any,
+    steps: Rollout,
+    advantage: jax.Array,
+    carry: Any,
+    entropy_weight: float,
+    clip: float,
+) -> Any:
+    """PPO's loss (Schulman et al. 2017, Eq. 7), how many ratios it clips, and its gradient."""
+
+    def total(params: Any) -> tuple[jax.Array, jax.Array]:
+        seen = (steps.obs, steps.prev_action_probs, steps.is_first, steps.dropout_mask)
+        _, out = forward(params, carry, *seen)
+        probs = jax.nn.softmax(out.logits)
+        chosen = jnp.take_along_axis(probs, steps.action[..., None], -1)[..., 0]
+        ratio = chosen / jnp.exp(steps.log_prob)
+        policy = jnp.where(
+            advantage > 0,
+            jnp.where(ratio > 1 + clip, 1 + clip, ratio) * advantage,
+            jnp.where(ratio < 1 - clip, 1 - clip, ratio) * advantage,
+        )
+        critic = 0.5 * (out.value - (steps.value + advantage)) ** 2
+        entropy = -(probs * jnp.log(probs)).sum(-1)
+        each = -policy + CONFIG.value_weight * critic - entropy_weight * entropy
+        counted = ~steps.bootstrap_only
+        clipped = counted & (jnp.abs(ratio - 1) > clip)
+        return jnp.where(counted, each, 0).sum() / counted.sum(), clipped.sum()
+
+    return jax.value_and_grad(total, has_aux=True)(params)
+
+
+@pytest.mark.parametrize(("parts", "epochs"), [(3, 2), (1, 2)])
+def test_several_optimiser_steps_are_ppo_on_every_so_manieth_environment(
+    parts: int, epochs: int
+) -> None:
+    config = dataclasses.replace(
+        CONFIG, num_minibatches=parts, update_epochs=epochs, clip_coef=0.05, learning_rate=0.01
+    )
+    state, progress = start(5), 0.25
+    entropy_weight = 0.01 + progress * (0.002 - 0.01)
+    key = jax.random.fold_in(state.key, 0)
+    _, steps, last = rollout(state, key, CONFIG, MODEL, WORDS, PARAMS)
+    advantage = advantages_of(steps, last)
+    steps = steps._replace(activations=None)
+    adam = TorchAdam(0.01 * (1 - progress), config.adam_epsilon, amsgrad=False)
+    expected, clipped, norms = state.params, 0, []
+    for _ in range(epochs):
+        for part in range(parts):
+            mine = slice(part, None, parts)
+            given = jax.tree.map(lambda x, mine=mine: x[:, mine], (steps, advantage))
+            carry = jax.tree.map(lambda x, mine=mine: x[mine], state.recurrent.carry)
+            (_, count), grads = ppo(expected, *given, carry, entropy_weight, clip=0.05)
+            clipped += int(count)
+            grads = jax.device_get(grads)
+            norms.append(np.sqrt(sum((leaf**2).sum() for leaf in jax.tree.leaves(grads))))
+            share = min(1.0, config.max_grad_norm / norms[-1])
+            change = adam.step(jax.tree.map(lambda leaf, by=share: by * leaf, grads))
+            expected = jax.tree.map(np.add, jax.device_get(expected), change)
+    assert clipped > 10
+    after, metrics = update(state, jnp.float32(progress), config, MODEL, WORDS, PARAMS)
+    chex.assert_trees_all_close(after.params, expected, rtol=1e-3, atol=1e-4)
+    assert float(metrics["grad_norm"]) == pytest.approx(np.mean(norms), rel=1e-3)
+    assert int(after.updates) == 1
+    assert int(after.skipped) == 0
+
+
+def test_a_step_that_is_not_finite_is_left_out_and_the_others_are_taken() -> None:
+    state = start(5)
+    carry = jax.tree.map(lambda x: x.at[1].set(jnp.nan), state.recurrent.carry)
+    broken = state.replace(
+        recurrent=state.recurrent.replace(carry=carry, is_first=jnp.zeros(B, bool))
+    )
+    config = dataclasses.replace(CONFIG, num_minibatches=2)
+    after, _ = update(broken, jnp.float32(0), config, MODEL, WORDS, PARAMS)
+    assert int(after.skipped) == 1
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after.params))
+    moved = jax.tree.map(lambda new, old: (new != old).any(), after.params, state.params)
+    assert any(jax.tree.leaves(moved))
 
 
 def test_only_large_kernels_are_rounded_while_acting() -> None:
