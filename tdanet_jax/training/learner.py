@@ -262,11 +262,9 @@ def minibatches(experience: Experience, count: int) -> Experience:
         shape = (*x.shape[:axis], x.shape[axis] // count, count, *x.shape[axis + 1 :])
         return jnp.moveaxis(x.reshape(shape), axis + 1, 0)
 
-    steps, advantage, carry = experience
-    return Experience(
-        *jax.tree.map(lambda x: split(x, 1), (steps, advantage)),
-        jax.tree.map(lambda x: split(x, 0), carry),
-    )
+    steps, advantage = jax.tree.map(lambda x: split(x, 1), experience[:2])
+    carry = jax.tree.map(lambda x: split(x, 0), experience.carry)
+    return Experience(steps, advantage, carry)
 
 
 def learn(
