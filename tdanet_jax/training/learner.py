@@ -239,12 +239,12 @@ def loss(
     log_probs = jax.nn.log_softmax(out.logits)
     log_prob = jnp.take_along_axis(log_probs, steps.action[..., None], -1)[..., 0]
     entropy = mean(-jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1))
-    if config.optimizer_steps == 1:
-        policy_loss = -mean(log_prob * advantage)
-    else:
+    gain = log_prob * advantage
+    if config.optimizer_steps > 1:  # after the first one, the network is not the one that acted
         ratio = jnp.exp(log_prob - steps.log_prob)
         clipped = jnp.clip(ratio, 1.0 - config.clip_coef, 1.0 + config.clip_coef)
-        policy_loss = -mean(jnp.minimum(ratio * advantage, clipped * advantage))
+        gain = jnp.minimum(ratio * advantage, clipped * advantage)
+    policy_loss = -mean(gain)
     value_loss = mean(0.5 * (steps.value + advantage - out.value) ** 2)
     total = policy_loss + config.value_weight * value_loss - entropy_weight * entropy
     parts = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
