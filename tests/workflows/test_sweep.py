@@ -37,11 +37,11 @@ def test_a_split_of_ones_own_is_planned_under_its_one_name():
 
 
 def test_a_model_may_have_a_configuration_of_its_own():
-    own = dataclasses.replace(BASE, learner=LearnerConfig(num_envs=64))
+    own = dataclasses.replace(BASE, learner=LearnerConfig(num_envs=16))
     plan = sweep.plan(BASE, ("18/4", "14/8"), ("tdanet", "savn"), (3,), {"savn": own})
     assert [(c.split, c.model, c.seed, c.learner.num_envs) for c in plan] == [
-        ("18/4", "tdanet", 3, 256), ("18/4", "savn", 3, 64),
-        ("14/8", "tdanet", 3, 256), ("14/8", "savn", 3, 64),
+        ("18/4", "tdanet", 3, 64), ("18/4", "savn", 3, 16),
+        ("14/8", "tdanet", 3, 64), ("14/8", "savn", 3, 16),
     ]  # fmt: skip
 
 

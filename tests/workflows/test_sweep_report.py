@@ -69,18 +69,18 @@ def test_runs_of_other_flags_are_apart(tmp_path):
 
 
 def test_what_each_model_was_trained_with_is_told_where_it_differs(tmp_path, report):
-    own = dataclasses.replace(BASE, model="savn", learner=LearnerConfig(num_envs=64))
+    own = dataclasses.replace(BASE, model="savn", learner=LearnerConfig(num_envs=16))
     run = sweep.finished(made(tmp_path, own, result(model="savn")))
     assert "Settings that differ" not in sweep_report.markdown(report, {})
     costs = {**report.costs, "savn": Cost("savn", 1000, {1: 1.0, 1024: 2.0})}
     report = dataclasses.replace(report, runs=[*report.runs, run], costs=costs)
     page = sweep_report.markdown(report, {})
     table = page[page.index("| Model | --num-envs |") :].splitlines()
-    assert table[2:6] == ["| tdanet | 256 |", "| tdanet-no-ta | 256 |", "| savn | 64 |", ""]
+    assert table[2:6] == ["| tdanet | 64 |", "| tdanet-no-ta | 64 |", "| savn | 16 |", ""]
     used = {
         run["model"]: run["settings"]["--num-envs"] for run in sweep_report.to_json(report)["runs"]
     }
-    assert used == {"tdanet": 256, "tdanet-no-ta": 256, "savn": 64}
+    assert used == {"tdanet": 64, "tdanet-no-ta": 64, "savn": 16}
 
 
 def test_runs_that_are_not_finished_are_named(report):
