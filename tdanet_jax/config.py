@@ -46,12 +46,12 @@ class LearnerConfig:
     rollout_steps: int = 20
     """Actions per environment and update (T)."""
     num_minibatches: int = 1
-    """Optimiser steps in which a rollout is learnt from (PPO), each from an equal share of the
-    environments. For GPUs, which need more environments than are good to learn from at once."""
+    """Minibatches that a rollout is split into by environment, one optimiser step each (PPO). For
+    GPUs, which need more environments than one step should learn from."""
     update_epochs: int = 1
-    """Times that a rollout is learnt from (PPO)."""
+    """Passes over each rollout (PPO)."""
     clip_coef: float = 0.2
-    """PPO's clip of the ratio of probabilities; no effect if a rollout is one optimiser step."""
+    """PPO's clip of the probability ratio; no effect if an update is one optimiser step."""
     learning_rate: float = 5e-4
     """Adam's initial learning rate."""
     final_learning_rate: float = 0.0

@@ -16,8 +16,8 @@ from tdanet_jax import commands
 
 #: Seconds after which a stop that waits for a library, or was dropped, is raised again.
 RETRY_SECONDS = 0.05
-#: Files whose functions must not be interrupted: the import system, and JAX's start of a backend,
-#: which would leave a thread behind for which the program then waits at its end.
+#: Files whose functions must not be interrupted: the import system, and JAX's start of its
+#: backends. If that is interrupted, a timer thread of it keeps running and delays the exit.
 STARTING = ("<frozen importlib._bootstrap>", os.path.join("jax", "_src", "xla_bridge.py"))
 
 
@@ -56,7 +56,7 @@ class StopRequest:
     def __init__(self) -> None:
         self.signal: int | None = None
         self._deferring = False
-        self._starts = 0  # of libraries that were under way when we began to receive
+        self._starts = 0  # `_starts` of the frame in which we began to receive
         self._alarm: Any = None  # the handler of SIGALRM before ours
         self._asked = False  # whether the timer is ours
 

@@ -4,8 +4,8 @@ File order is execution order: `init` makes the state, `rollout` acts for T step
 environments, `loss` looks back at them, `learn` takes an optimiser step, `update` does all of
 this, and `make_train` compiles many updates into one call.
 
-A rollout is one optimiser step, or several, of which each learns from some of the environments:
-then the loss is that of PPO (Schulman et al. 2017).
+An update takes one optimiser step on its whole rollout, or several on minibatches of its
+environments, with the loss of PPO (Schulman et al. 2017).
 
 Axis letters: T steps of a rollout, B environments, H units, K detections, C classes.
 """
@@ -56,7 +56,7 @@ class Rollout(NamedTuple):
     prev_action_probs: jax.Array
     is_first: jax.Array
     dropout_mask: jax.Array | None
-    activations: Any  # of the network that acted; empty if another one will look back, too
+    activations: Any  # the activation cache; empty if an update has several optimiser steps
     action: jax.Array
     log_prob: jax.Array
     value: jax.Array
@@ -156,7 +156,7 @@ def rollout(
     class_table = actor_critic.prepare(model, state.params, words)
     rate = model.encoder.dropout
     batch, units = config.num_envs, model.encoder.dropout_units
-    # After an optimiser step, the activations are no longer those of the network.
+    # The cache holds for the parameters that acted, and so for the first optimiser step alone.
     collections = (ACTIVATIONS,) if config.optimizer_steps == 1 else ()
 
     def act(state: TrainState, step_key: jax.Array) -> tuple[TrainState, Rollout]:
@@ -254,8 +254,8 @@ def loss(
 def minibatches(experience: Experience, count: int) -> Experience:
     """`count` parts with a leading axis: part i has the environments i, i + count, ...
 
-    Environments are alike, so they need not be drawn; and if they are divided between devices, so
-    is every part.
+    Environments are interchangeable, so there is no need to shuffle them. If they are divided
+    between devices, so is every part.
     """
 
     def split(x: jax.Array, axis: int) -> jax.Array:

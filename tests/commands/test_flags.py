@@ -586,8 +586,7 @@ SHOWN = {
     "rollout_steps": "system/test_random_keys.py::test_no_key_repeats_in_a_run_of_two_updates",
     **dict.fromkeys(
         ("num_minibatches", "update_epochs", "clip_coef"),
-        "training/test_learner.py::test_several_optimiser_steps_are_ppo_on_every_so_manieth"
-        "_environment",
+        "training/test_learner.py::test_several_optimiser_steps_are_ppo_on_minibatches",
     ),
     "amsgrad": "training/test_learner.py::test_an_update_is_one_step_of_clipped_adam_on_the"
     "_gradient_of_the_loss",

@@ -431,9 +431,7 @@ def ppo(
 
 
 @pytest.mark.parametrize(("parts", "epochs"), [(3, 2), (1, 2)])
-def test_several_optimiser_steps_are_ppo_on_every_so_manieth_environment(
-    parts: int, epochs: int
-) -> None:
+def test_several_optimiser_steps_are_ppo_on_minibatches(parts: int, epochs: int) -> None:
     config = dataclasses.replace(
         CONFIG, num_minibatches=parts, update_epochs=epochs, clip_coef=0.05, learning_rate=0.01
     )
