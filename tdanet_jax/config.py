@@ -121,6 +121,10 @@ class NetworkConfig:
     detections. Not in the paper; for models that are shown a box of every object."""
     robust_triangulation: bool = False
     """Requires --triangulation, and makes it robust to errors of bearings (docs/noise.md)."""
+    reach_threshold: float = 0.0
+    """Requires --triangulation. Done is only allowed where the target is in view, and within reach
+    with at least this probability, which is estimated from triangulation alone and therefore for
+    unseen classes, too (docs/method.md). 0: it is not estimated, and Done is always allowed."""
     scores: bool = False
     """Show the detector's confidence in each detection, 1 without noise. Not in the paper; for
     models that are shown a box of every object."""
@@ -248,6 +252,8 @@ class TrainConfig:
         sense_noise.parse(self.learner.noise)
         if self.network.robust_triangulation and not self.network.triangulation:
             raise ValueError("--robust-triangulation: needs --triangulation")
+        if self.network.reach_threshold and not self.network.triangulation:
+            raise ValueError("--reach-threshold: needs --triangulation")
         self.network.spec.check()
 
     def in_rooms_alone(self) -> TrainConfig:
@@ -453,7 +459,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     (("generated",), lambda value: value <= MOST_GENERATED, f"be at most {MOST_GENERATED:,}"),
     (("size_noise",), lambda value: 0 <= value <= 2, "be between 0 and 2"),
     (("gamma", "gae_lambda"), lambda value: 0 <= value <= 1, "be between 0 and 1"),
-    (("dropout",), lambda value: 0 <= value < 1, "be at least 0 and below 1"),
+    (("dropout", "reach_threshold"), lambda value: 0 <= value < 1, "be at least 0 and below 1"),
 )  # fmt: skip
 
 

@@ -39,6 +39,11 @@ class ObservationSpec:
         """Numbers of each detection: x and y of the centre, the area S, and the score."""
         return 3 + self.scores
 
+    @property
+    def triangulation(self) -> str | None:
+        """The sensor that tracks the target, if there is one."""
+        return next((name for name in self.sensors if name in _TRACKING), None)
+
     def agent_name(self, model: str) -> str:
         """A model's name, and what it senses unlike the paper's agents: tdanet, --odometry."""
         flags = [f"--{name}" if name in SENSORS else f"--sensors {name}" for name in self.sensors]

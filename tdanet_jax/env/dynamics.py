@@ -183,6 +183,11 @@ def is_visible(pose: jax.Array, cls: jax.Array, params: EnvParams) -> jax.Array:
     return (cls >= 0) & ((word >> (cls & 31).astype(jnp.uint32)) & 1).astype(bool)
 
 
+def would_succeed(state: EnvState, params: EnvParams) -> jax.Array:
+    """Whether a `Done` would succeed now: the target is visible within 1.5 m."""
+    return is_visible(state.pose, params.target_class[state.target], params)
+
+
 def move(pose: jax.Array, action: jax.Array, params: EnvParams) -> jax.Array:
     """The pose after an action; an impossible action leaves it as it is."""
     position, rotation, horizon = params.grid.split(pose)
@@ -207,7 +212,7 @@ def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome
         moves = jnp.where(turns & noise.turn_fails(bits, state.noise), NUM_ACTIONS, action)
     pose = move(state.pose, moves, params)
     done = action == Action.DONE
-    success = done & is_visible(pose, params.target_class[state.target], params)
+    success = done & would_succeed(state, params)
     earns, partial, at_done, seen = _partial_reward(state, pose, params)
     reward = jnp.where(~done & earns, partial, STEP_REWARD)
     reward = jnp.where(success, DONE_REWARD + at_done, reward)

@@ -133,6 +133,11 @@ class Observation(struct.PyTreeNode):
     features: jax.Array | None = None  # [49, 512] float16, ResNet-18's map of an imported image
     sensors: Mapping[str, Any] = struct.field(default_factory=dict)  # readings by name
 
+    @property
+    def target_in_view(self) -> jax.Array:
+        """Whether a detection is of the target's class; with the leading axes of `target`."""
+        return jnp.any(self.mask & (self.classes == self.target[..., None]), axis=-1)
+
 
 class Outcome(NamedTuple):
     """What one action leads to, before any reset."""

@@ -15,9 +15,10 @@ from tdanet_jax.models.activation_cache import ACTIVATIONS
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import Linear
 from tdanet_jax.models.lstm import LSTM, Carry
+from tdanet_jax.models.reach import FORBIDDEN, ReachEstimate
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.sensors import suite
-from tdanet_jax.vocabulary import NUM_ACTIONS
+from tdanet_jax.vocabulary import NUM_ACTIONS, Action
 
 #: Units of the layer that embeds the sensors' features.
 SENSOR_UNITS = 64
@@ -28,6 +29,7 @@ class Output(NamedTuple):
 
     logits: jax.Array  # [..., 6], unnormalised log-probabilities of the actions
     value: jax.Array  # [...], expected discounted return
+    reach: jax.Array | None = None  # [...], logit of the target being within reach, if estimated
 
 
 class RecurrentState(struct.PyTreeNode):
@@ -53,6 +55,8 @@ class ActorCritic(nn.Module):
       dtype: operands of the LSTM's products.
       spec: what the agent is shown. A layer of `SENSOR_UNITS` adds the sensors' features to the
         encoder's; the paper's agent has no sensors.
+      reach_threshold: `Done` is only allowed where the target is in view, and estimated to be within
+        reach with at least this probability; 0 if this is not estimated.
     """
 
     encoder: Encoder
@@ -60,6 +64,7 @@ class ActorCritic(nn.Module):
     action_width: int = 10
     dtype: Any = jnp.float32
     spec: ObservationSpec = ObservationSpec()
+    reach_threshold: float = 0.0
 
     def setup(self) -> None:
         if self.spec.sensors:
@@ -71,6 +76,8 @@ class ActorCritic(nn.Module):
         small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
         self.actor = Linear(NUM_ACTIONS, kernel_init=small)
         self.critic = Linear(1)
+        if self.reach_threshold:
+            self.reach = ReachEstimate()
 
     def prepare(self, words: jax.Array) -> Any:
         """What the encoder can say from word vectors [C, D] alone; once per parameter change."""
@@ -99,7 +106,8 @@ class ActorCritic(nn.Module):
         if self.is_mutable_collection("intermediates"):
             self.sow("intermediates", "attention", self.encoder.attend(class_table, obs))
         carry, hidden = self.lstm(carry, features, skip_inputs, is_first)
-        return carry, self.decide(hidden)
+        out = self.decide(hidden)
+        return carry, self.within_reach(obs, out) if self.reach_threshold else out
 
     def perceive(
         self,
@@ -123,6 +131,13 @@ class ActorCritic(nn.Module):
     def decide(self, hidden: jax.Array) -> Output:
         """Policy and value, from hidden states [..., H]."""
         return Output(self.actor(hidden), self.critic(hidden)[..., 0])
+
+    def within_reach(self, obs: Observation, out: Output) -> Output:
+        """Policy and value with the estimate of reach, and without `Done` where it forbids it."""
+        logit = self.reach(obs.sensors[self.spec.triangulation])
+        allowed = obs.target_in_view & (jax.nn.sigmoid(logit) >= self.reach_threshold)
+        penalty = jnp.where(allowed, 0.0, FORBIDDEN)
+        return Output(out.logits.at[..., Action.DONE].add(penalty), out.value, logit)
 
     def initial_carry(self, batch: int, weights: Any, training: bool = False) -> Any:
         """The carry at the start of an episode: zeros.

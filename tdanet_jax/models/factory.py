@@ -42,7 +42,7 @@ def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
     )
     spec.check(config.model)
     suite.make(spec)  # a sensor that cannot be made is refused here, too
-    return model.clone(spec=spec)
+    return model.clone(spec=spec, reach_threshold=network.reach_threshold)
 
 
 def resolve_precision(config: NetworkConfig) -> NetworkConfig:

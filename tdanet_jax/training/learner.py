@@ -23,7 +23,7 @@ from flax import struct
 from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import EnvParams, EnvState, Observation
-from tdanet_jax.models import actor_critic
+from tdanet_jax.models import actor_critic, reach
 from tdanet_jax.models.activation_cache import ACTIVATIONS
 from tdanet_jax.models.actor_critic import ActorCritic, RecurrentState
 from tdanet_jax.training.gae import advantages
@@ -67,6 +67,7 @@ class Rollout(NamedTuple):
     success: jax.Array
     length: jax.Array
     shortest: jax.Array
+    within_reach: jax.Array | None  # the target was, before the action; if the network estimates it
 
 
 class Experience(NamedTuple):
@@ -149,6 +150,7 @@ def rollout(
     scope = jax.named_scope("environment")
     observe = scope(jax.vmap(dynamics.observe, (0, None)))
     transition = scope(jax.vmap(dynamics.transition, (0, 0, None)))
+    within_reach = scope(jax.vmap(lambda state: dynamics.would_succeed(state, params)))
     # Cast once per rollout what every step would cast: the kernels of the large products.
     weights = jax.tree.map(
         lambda x: x.astype(model.dtype) if x.ndim > 1 and x.size > SMALL else x, state.params
@@ -190,6 +192,7 @@ def rollout(
             success=moved.success & ~only,
             length=moved.state.steps,
             shortest=state.env_state.shortest,
+            within_reach=within_reach(state.env_state) if model.reach_threshold else None,
         )
         following = state.replace(
             env_state=dynamics.choose(terminal, begun, moved.state),
@@ -231,10 +234,9 @@ def loss(
         model, weights, class_table, carry, *inputs, activations=steps.activations
     )
     counted = ~steps.bootstrap_only
-    count = counted.sum()
 
-    def mean(x: jax.Array) -> jax.Array:
-        return jnp.sum(jnp.where(counted, x, 0.0)) / count
+    def mean(x: jax.Array, among: jax.Array = counted) -> jax.Array:
+        return jnp.sum(jnp.where(among, x, 0.0)) / jnp.maximum(among.sum(), 1)
 
     log_probs = jax.nn.log_softmax(out.logits)
     log_prob = jnp.take_along_axis(log_probs, steps.action[..., None], -1)[..., 0]
@@ -248,6 +250,10 @@ def loss(
     value_loss = mean(0.5 * (steps.value + advantage - out.value) ** 2)
     total = policy_loss + config.value_weight * value_loss - entropy_weight * entropy
     parts = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
+    if out.reach is not None:
+        surprise = optax.sigmoid_binary_cross_entropy(out.reach, steps.within_reach)
+        parts["reach_loss"] = mean(surprise, counted & steps.obs.target_in_view)
+        total += reach.WEIGHT * parts["reach_loss"]
     return total, parts
 
 

@@ -1,0 +1,39 @@
+"""Whether the target is within reach, estimated without knowing what it is.
+
+An agent learns how large a class looks where a `Done` succeeds, and misjudges classes that it was
+never trained to find: most of its failures on them are a `Done` too far away. Triangulation tells
+where the target seems to be, how large it is and how certain that is. From these numbers alone, two
+hidden layers estimate how probable it is that the target in view is within reach. They are trained
+with the agent, on what is within reach in the training rooms; as no name enters, the estimate
+holds for other classes as well.
+"""
+
+from __future__ import annotations
+
+import jax
+from flax import linen as nn
+
+from tdanet_jax.models.layers import Linear
+
+#: Units of each hidden layer.
+UNITS = 64
+#: The estimate's weight in the loss. As nothing else depends on its parameters, the size of Adam's
+#: steps does not depend on it; but gradients are clipped together, and it should count little there.
+WEIGHT = 0.1
+#: What is added to the logit of `Done` where it is not allowed. Being finite, it gives finite losses.
+FORBIDDEN = -50.0
+
+
+class ReachEstimate(nn.Module):
+    """From the reading of triangulation to the estimate's logit."""
+
+    def setup(self) -> None:
+        self.linear1 = Linear(UNITS)
+        self.linear2 = Linear(UNITS)
+        # An agent that may not say Done learns nothing: at first, everything is within reach.
+        probable = nn.initializers.constant(2.0)
+        self.linear3 = Linear(1, kernel_init=nn.initializers.zeros, bias_init=probable)
+
+    def __call__(self, reading: jax.Array) -> jax.Array:
+        """[..., 9] -> [...]."""
+        return self.linear3(nn.relu(self.linear2(nn.relu(self.linear1(reading)))))[..., 0]
