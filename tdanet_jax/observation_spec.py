@@ -40,9 +40,9 @@ class ObservationSpec:
         return 3 + self.scores
 
     @property
-    def triangulation(self) -> str | None:
-        """The sensor that tracks the target, if there is one."""
-        return next((name for name in self.sensors if name in _TRACKING), None)
+    def tracker(self) -> str:
+        """The sensor that tracks the target; "" if there is none."""
+        return next((name for name in self.sensors if name in _TRACKING), "")
 
     def agent_name(self, model: str) -> str:
         """A model's name, and what it senses unlike the paper's agents: tdanet, --odometry."""

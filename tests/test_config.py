@@ -71,6 +71,16 @@ def test_paper_preset_has_the_reference_constants():
             "--robust-triangulation: needs --triangulation",
         ),
         (
+            TrainConfig(network=NetworkConfig(odometry=True, reach_threshold=0.5)),
+            "--reach-threshold: needs --triangulation",
+        ),
+        (
+            TrainConfig(
+                network=NetworkConfig(odometry=True, triangulation=True, reach_threshold=1.0)
+            ),
+            "--reach-threshold 1.0: must be at least 0 and below 1",
+        ),
+        (
             TrainConfig(network=NetworkConfig(odometry=True, triangulation=True, rows="class")),
             "--triangulation: needs a box of every object, which --rows class does not show",
         ),

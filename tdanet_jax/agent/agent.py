@@ -321,6 +321,7 @@ def _decision(
         probabilities=probabilities,
         value=float(np.asarray(out.value)[0]),
         attention=None if attention is None else np.asarray(attention)[0][owner],
+        reach=None if out.reach is None else float(1 / (1 + np.exp(-np.asarray(out.reach)[0]))),
     )
     return state._replace(action=np.int32(action)), decision
 

@@ -26,6 +26,7 @@ class Decision(NamedTuple):
     probabilities: np.ndarray  # [6], in the order of `Action`; 0 for what is forbidden
     value: float  # expected discounted return
     attention: np.ndarray | None  # [n], weight of each detection; None if the model has none
+    reach: float | None = None  # probability that the target, if in view, is within 1.5 m
 
 
 def softmax(x: np.ndarray) -> np.ndarray:

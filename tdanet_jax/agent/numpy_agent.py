@@ -48,6 +48,8 @@ class Meta:
     hidden: int  # units of the LSTM
     action_units: int  # that embed the previous step's action probabilities
     sensor_units: int  # that embed what the sensors say; 0 without sensors
+    reach_threshold: float  # as in NetworkConfig
+    reach_units: int  # of each hidden layer of the estimate of reach; 0 without it
     target_box: tuple[float, ...]  # [F], of the target's row, before its word vector
 
     @property
@@ -61,7 +63,10 @@ class Meta:
 _KINDS: dict[str, type] = {
     "classes": list, "rows": str, "sensors": list, "scores": bool, "word_norm": float,
     "width": int, "hidden": int, "action_units": int, "sensor_units": int, "target_box": list,
+    "reach_threshold": float, "reach_units": int,
 }  # fmt: skip
+#: Fields that folders of older versions lack.
+_DEFAULTS = {"reach_threshold": 0.0, "reach_units": 0}
 
 
 class AgentState(NamedTuple):
@@ -145,6 +150,9 @@ class NumPyAgent(BaseAgent):
         action_features = _relu(self._layer("action_embedding", state.probabilities))
         hidden, cell = self._lstm(features, action_features, state.hidden, state.cell)
         logits = self._layer("actor", hidden)
+        reach = self._reach(sensors) if self.meta.reach_units else None
+        if reach is not None and not (goal in labels and reach >= self.meta.reach_threshold):
+            logits = without(logits, [Action.DONE])
         probabilities = shown = softmax(logits)
         if forbidden:
             logits = without(logits, forbidden)
@@ -154,7 +162,7 @@ class NumPyAgent(BaseAgent):
             action = int(key.choice(NUM_ACTIONS, p=shown / shown.sum(dtype=float)))
         value = float(self._layer("critic", hidden)[0])
         after = AgentState(hidden, cell, probabilities, action, sensors, goal)
-        return after, Decision(Action(action), shown, value, attention[owner])
+        return after, Decision(Action(action), shown, value, attention[owner], reach)
 
     def key(self, seed: int, step: int) -> np.random.Generator:
         """The `key` with which `act` samples an action; another one for each seed and step."""
@@ -196,6 +204,13 @@ class NumPyAgent(BaseAgent):
         difference = np.abs(self._branch(attention @ inputs) - target.reference)
         third = _relu(self._layer("encoder/linear3", difference))
         return attention, _relu(self._layer("encoder/linear4", third))
+
+    def _reach(self, sensors: numpy_sensors.States) -> float:
+        """How probable it is that the target, if in view, is within reach (`models.reach`)."""
+        reading = numpy_sensors.read(self.spec, sensors)[self.spec.tracker]
+        hidden = _relu(self._layer("reach/linear1", reading))
+        hidden = _relu(self._layer("reach/linear2", hidden))
+        return float(_sigmoid(self._layer("reach/linear3", hidden))[0])
 
     def _branch(self, inputs: np.ndarray) -> np.ndarray:
         first = _relu(self._layer("encoder/linear1", inputs))
@@ -258,6 +273,10 @@ def shapes(meta: Meta, word: int) -> dict[str, tuple[int, ...]]:
     if spec.sensors:
         width = sum(numpy_sensors.WIDTHS[name] for name in spec.sensors)
         layers["way"] = width, meta.sensor_units
+    if meta.reach_units:
+        layers["reach/linear1"] = numpy_sensors.WIDTHS["triangulation"], meta.reach_units
+        layers["reach/linear2"] = meta.reach_units, meta.reach_units
+        layers["reach/linear3"] = meta.reach_units, 1
     kernels = {f"{name}/kernel": shape for name, shape in layers.items()}
     biases = {f"{name}/bias": shape[1:] for name, shape in layers.items()}
     return {
@@ -272,6 +291,7 @@ def shapes(meta: Meta, word: int) -> dict[str, tuple[int, ...]]:
 
 def _read_meta(path: Path) -> Meta:
     values = _read_json(path)
+    values = {**_DEFAULTS, **values} if isinstance(values, dict) else values
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise FileError(path, f"not an agent in the format that this version reads, {FORMAT}")
     for name, kind in _KINDS.items():

@@ -55,8 +55,8 @@ class ActorCritic(nn.Module):
       dtype: operands of the LSTM's products.
       spec: what the agent is shown. A layer of `SENSOR_UNITS` adds the sensors' features to the
         encoder's; the paper's agent has no sensors.
-      reach_threshold: `Done` is only allowed where the target is in view, and estimated to be within
-        reach with at least this probability; 0 if this is not estimated.
+      reach_threshold: `Done` is only allowed where the target is in view, and within reach with at
+        least this estimated probability; 0 if there is no estimate.
     """
 
     encoder: Encoder
@@ -134,7 +134,7 @@ class ActorCritic(nn.Module):
 
     def within_reach(self, obs: Observation, out: Output) -> Output:
         """Policy and value with the estimate of reach, and without `Done` where it forbids it."""
-        logit = self.reach(obs.sensors[self.spec.triangulation])
+        logit = self.reach(obs.sensors[self.spec.tracker])
         allowed = obs.target_in_view & (jax.nn.sigmoid(logit) >= self.reach_threshold)
         penalty = jnp.where(allowed, 0.0, FORBIDDEN)
         return Output(out.logits.at[..., Action.DONE].add(penalty), out.value, logit)

@@ -17,10 +17,10 @@ from tdanet_jax.models.layers import Linear
 
 #: Units of each hidden layer.
 UNITS = 64
-#: The estimate's weight in the loss. As nothing else depends on its parameters, the size of Adam's
-#: steps does not depend on it; but gradients are clipped together, and it should count little there.
+#: The estimate's weight in the loss. The size of Adam's steps does not depend on it, for nothing
+#: else trains these parameters; but gradients are clipped together, where it should count little.
 WEIGHT = 0.1
-#: What is added to the logit of `Done` where it is not allowed. Being finite, it gives finite losses.
+#: Added to the logit of `Done` where it is not allowed; finite, so that losses are.
 FORBIDDEN = -50.0
 
 

@@ -111,15 +111,21 @@ def after(
     return out
 
 
-def features(spec: ObservationSpec, states: States) -> np.ndarray:
-    """What the sensors say, as the network's input: [width] float32."""
-    parts = [
-        _read_odometry(spec.grid, state)
-        if name == "odometry"
-        else _read_estimate(spec.grid, state, states["odometry"])
+def read(spec: ObservationSpec, states: States) -> dict[str, np.ndarray]:
+    """What the sensors say, by name, as the network's inputs: each [width] float32."""
+    return {
+        name: (
+            _read_odometry(spec.grid, state)
+            if name == "odometry"
+            else _read_estimate(spec.grid, state, states["odometry"])
+        ).astype(np.float32)
         for name, state in states.items()
-    ]
-    return np.concatenate(parts).astype(np.float32)
+    }
+
+
+def features(spec: ObservationSpec, states: States) -> np.ndarray:
+    """What all of them say, [width]."""
+    return np.concatenate([*read(spec, states).values()])
 
 
 def _moved(

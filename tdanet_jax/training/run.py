@@ -363,5 +363,6 @@ def _chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
 
 #: Means over updates; there is a `reach_loss` if the network estimates reach.
 _UPDATE_MEANS = (
-    "policy_loss", "value_loss", "entropy", "reach_loss", "explained_variance", "grad_norm", "learning_rate",
+    "policy_loss", "value_loss", "entropy", "reach_loss", "explained_variance", "grad_norm",
+    "learning_rate",
 )  # fmt: skip

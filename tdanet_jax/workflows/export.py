@@ -18,6 +18,7 @@ from tdanet_jax.agent.numpy_agent import FORMAT, META_FILE, MODEL_FILE, WORDS_FI
 from tdanet_jax.config import find_word_vectors
 from tdanet_jax.io import archive, assets, files
 from tdanet_jax.io.bundled_agents import find_run, folder_of
+from tdanet_jax.models import reach
 from tdanet_jax.models.actor_critic import SENSOR_UNITS
 from tdanet_jax.models.tdanet import TARGET_BOX
 from tdanet_jax.sensors.numpy_sensors import WIDTHS
@@ -90,6 +91,8 @@ def _write_agent(agent: Agent, word_vectors: str | None, folder: Path) -> None:
         "hidden": network.hidden,
         "action_units": agent.model.action_width,
         "sensor_units": SENSOR_UNITS if spec.sensors else 0,
+        "reach_threshold": float(network.reach_threshold),
+        "reach_units": reach.UNITS if network.reach_threshold else 0,
         "target_box": TARGET_BOX[: spec.columns],
     }
     weights = traverse_util.flatten_dict(jax.device_get(agent.weights), sep="/")

@@ -38,6 +38,7 @@ NETWORKS = {
         "triangulation": True,
         "robust_triangulation": True,
         "scores": True,
+        "reach_threshold": 0.5,
     },
     "rows": {"odometry": True, "rows": "class"},
 }
@@ -81,7 +82,7 @@ def test_it_decides_as_in_jax(preset, glove, tmp_path):
     ours = numpy_agent.load(exported(theirs, tmp_path / "out"))
     rng = np.random.default_rng(0)
     one, other = theirs.start(45), ours.start(45)
-    never = (Action.LOOK_UP,)
+    never, reached = (Action.LOOK_UP,), set()
     for number in range(25):
         seen, target = draw_frame(rng), "mug" if number < 15 else "zebra"
         given = {"blocked": bool(rng.random() < 0.3), "forbidden": never if number % 2 else ()}
@@ -92,6 +93,13 @@ def test_it_decides_as_in_jax(preset, glove, tmp_path):
         np.testing.assert_allclose(found.probabilities, expected.probabilities, atol=loose)
         np.testing.assert_allclose(found.value, expected.value, atol=10 * loose)
         np.testing.assert_allclose(found.attention, expected.attention, atol=1e-5)
+        assert (found.reach is None) == (preset != "robust")
+        if found.reach is not None:
+            np.testing.assert_allclose(found.reach, expected.reach, atol=loose)
+            may = found.reach >= 0.5 and target in {one.label for one in seen}
+            assert may or found.probabilities[Action.DONE] < 1e-15
+            reached.add(may)
+    assert preset != "robust" or reached == {True, False}
 
 
 def test_a_navigator_runs_it(folder):

@@ -628,7 +628,7 @@ OF_THE_TASK: dict[str, tuple[Any, str]] = {
     "sensors": (("odometry",), "tdanet"), "inner_rate": (0.1, "savn"),
     "first_order": (True, "savn"), "precision": ("bfloat16", "tdanet"), "split": ("14/8", "tdanet"),
     "model": ("ssnet", "tdanet"), "noise": ("mix", "tdanet"), "scores": (True, "tdanet"),
-    "robust_triangulation": (True, "tdanet"),
+    "robust_triangulation": (True, "tdanet"), "reach_threshold": (0.5, "tdanet"),
 }  # fmt: skip
 #: Settings with a test of their own below.
 HERE = ("data", "word_vectors", "checkpoint_minutes")
@@ -666,9 +666,9 @@ def contents(config: TrainConfig) -> tuple[Any, ...]:
 def test_a_setting_makes_another_task(name: str) -> None:
     value, model = OF_THE_TASK[name]
     config = TrainConfig(model=model, network=NetworkConfig(precision="float32", image="raster"))
-    if "triangulation" in name:
+    if "triangulation" in name or name == "reach_threshold":
         config = changed(config, "odometry", True)
-    if name == "robust_triangulation":
+    if name in ("robust_triangulation", "reach_threshold"):
         config = changed(config, "triangulation", True)
     other = changed(config, name, value)
     other.check()
