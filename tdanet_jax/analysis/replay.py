@@ -100,9 +100,9 @@ def _step(trace: Trace, tables: SceneTables, i: int) -> dict[str, Any]:
         step["attention"] = _rounded(weights, 4)
     if not last:
         step["action"] = int(trace.actions[i])
-        for name in ("probabilities", "value", "difference"):
+        for name in ("probabilities", "value", "difference", "reach"):
             values = getattr(trace, name)
-            if values is not None:
+            if values is not None and not np.isnan(values[i]).any():
                 step[name] = _rounded(values[i], 4)
     return step
 

@@ -140,6 +140,7 @@ class Trace:
         a network with a row per class, every object of the class has the row's weight.
       correspondence: the same, before the softmax (Eq. 1).
       difference: [T], mean over the units of the Siamese comparison's absolute difference.
+      reach: [T], estimated probability of the target being within reach; NaN where it is not seen.
     """
 
     player: str
@@ -154,6 +155,7 @@ class Trace:
     attention: tuple[np.ndarray, ...] | None = None
     correspondence: tuple[np.ndarray, ...] | None = None
     difference: np.ndarray | None = None
+    reach: np.ndarray | None = None
 
     @property
     def outcome(self) -> str:
@@ -243,6 +245,7 @@ def _with_network(player: Player, tables: SceneTables, trace: Trace, goal: int) 
         attention=by_object(steps.attention),
         correspondence=by_object(steps.correspondence),
         difference=steps.difference,
+        reach=steps.reach,
     )
 
 
@@ -262,6 +265,7 @@ class _NetworkSteps(NamedTuple):
     attention: jax.Array | None  # [N, K]
     correspondence: jax.Array | None  # [N, K]
     difference: jax.Array | None  # [N]
+    reach: jax.Array | None  # [N]
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -285,6 +289,9 @@ def _network(
             attention=frame.attention,
             correspondence=frame.correspondence,
             difference=None if frame.difference is None else frame.difference.mean(-1),
+            reach=None
+            if out.reach is None
+            else jnp.where(obs.target_in_view, jax.nn.sigmoid(out.reach), jnp.nan),
         )
         state = dynamics.transition(state, action, params).state
         return (state, recurrent), jax.tree.map(lambda x: x[0], computed)
