@@ -55,8 +55,8 @@ class ActorCritic(nn.Module):
       dtype: operands of the LSTM's products.
       spec: what the agent is shown. A layer of `SENSOR_UNITS` adds the sensors' features to the
         encoder's; the paper's agent has no sensors.
-      reach_threshold: `Done` is only allowed where the target is in view, and within reach with at
-        least this estimated probability; 0 if there is no estimate.
+      reach_threshold: after training, `Done` is only allowed where the target is in view and, with at
+        least this estimated probability, within reach; 0 if there is no estimate.
     """
 
     encoder: Encoder
@@ -107,7 +107,9 @@ class ActorCritic(nn.Module):
             self.sow("intermediates", "attention", self.encoder.attend(class_table, obs))
         carry, hidden = self.lstm(carry, features, skip_inputs, is_first)
         out = self.decide(hidden)
-        return carry, self.within_reach(obs, out) if self.reach_threshold else out
+        if self.reach_threshold:
+            out = out._replace(reach=self.reach(obs.sensors[self.spec.tracker]))
+        return carry, out
 
     def perceive(
         self,
@@ -131,13 +133,6 @@ class ActorCritic(nn.Module):
     def decide(self, hidden: jax.Array) -> Output:
         """Policy and value, from hidden states [..., H]."""
         return Output(self.actor(hidden), self.critic(hidden)[..., 0])
-
-    def within_reach(self, obs: Observation, out: Output) -> Output:
-        """Policy and value with the estimate of reach, and without `Done` where it forbids it."""
-        logit = self.reach(obs.sensors[self.spec.tracker])
-        allowed = obs.target_in_view & (jax.nn.sigmoid(logit) >= self.reach_threshold)
-        penalty = jnp.where(allowed, 0.0, FORBIDDEN)
-        return Output(out.logits.at[..., Action.DONE].add(penalty), out.value, logit)
 
     def initial_carry(self, batch: int, weights: Any, training: bool = False) -> Any:
         """The carry at the start of an episode: zeros.
@@ -207,20 +202,32 @@ def act(
     obs: Observation,
     dropout_mask: jax.Array | None = None,
     collections: Collection[str] = (),
+    training: bool = False,
 ) -> tuple[RecurrentState, Output, Any]:
     """One step of a batch of B environments; everything that acts goes through here.
 
     Args:
       collections: Flax collections to return: `ACTIVATIONS` while training, "intermediates" for the
         attention, its logits and the Siamese difference.
+      training: whether `Done` is allowed out of reach, too.
 
     Returns:
       The state after the step, policy and value, and the collections by name.
     """
     inputs = (class_table, state.carry, obs, state.prev_action_probs, state.is_first, dropout_mask)
     (carry, out), kept = model.apply({"params": weights}, *inputs, mutable=list(collections))
+    if not training:
+        out = _without_done_out_of_reach(model, obs, out)
     after = RecurrentState(carry, jax.nn.softmax(out.logits), jnp.zeros_like(state.is_first))
     return after, out, kept
+
+
+def _without_done_out_of_reach(model: ActorCritic, obs: Observation, out: Output) -> Output:
+    if out.reach is None:
+        return out
+    within = obs.target_in_view & (jax.nn.sigmoid(out.reach) >= model.reach_threshold)
+    done = jnp.where(within, out.logits[..., Action.DONE], FORBIDDEN)
+    return out._replace(logits=out.logits.at[..., Action.DONE].set(done))
 
 
 def forward(

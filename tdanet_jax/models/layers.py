@@ -22,7 +22,6 @@ class Linear(nn.Module):
     features: int
     dtype: Any = jnp.float32  # of the operands; parameters and results are float32
     kernel_init: Any = nn.initializers.lecun_normal()
-    bias_init: Any = nn.initializers.zeros
     use_bias: bool = True
 
     @nn.compact
@@ -31,7 +30,7 @@ class Linear(nn.Module):
         kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
         y = dense_product(self, x, kernel, self.dtype)
         if self.use_bias:
-            y += self.param("bias", self.bias_init, (self.features,))
+            y += self.param("bias", nn.initializers.zeros, (self.features,))
         return y + self.per_environment(x) if self.adapted else y
 
     @property

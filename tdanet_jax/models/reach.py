@@ -6,6 +6,9 @@ where the target seems to be, how large it is and how certain that is. From thes
 hidden layers estimate how probable it is that the target in view is within reach. They are trained
 with the agent, on what is within reach in the training rooms; as no name enters, the estimate
 holds for other classes as well.
+
+In training nothing is forbidden, so that the agent keeps a judgement of its own; after training,
+both must agree.
 """
 
 from __future__ import annotations
@@ -20,8 +23,8 @@ UNITS = 64
 #: The estimate's weight in the loss. The size of Adam's steps does not depend on it, for nothing
 #: else trains these parameters; but gradients are clipped together, where it should count little.
 WEIGHT = 0.1
-#: Added to the logit of `Done` where it is not allowed; finite, so that losses are.
-FORBIDDEN = -50.0
+#: The logit of `Done` where it is not allowed.
+FORBIDDEN = -1e9
 
 
 class ReachEstimate(nn.Module):
@@ -30,9 +33,7 @@ class ReachEstimate(nn.Module):
     def setup(self) -> None:
         self.linear1 = Linear(UNITS)
         self.linear2 = Linear(UNITS)
-        # An agent that may not say Done learns nothing: at first, everything is within reach.
-        probable = nn.initializers.constant(2.0)
-        self.linear3 = Linear(1, kernel_init=nn.initializers.zeros, bias_init=probable)
+        self.linear3 = Linear(1)
 
     def __call__(self, reading: jax.Array) -> jax.Array:
         """[..., 9] -> [...]."""

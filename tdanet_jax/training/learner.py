@@ -166,7 +166,7 @@ def rollout(
         obs = observe(state.env_state, params)
         mask = _dropout_mask(dropout_key, rate, (batch, units)) if rate else None
         recurrent, out, kept = actor_critic.act(
-            model, weights, class_table, state.recurrent, obs, mask, collections=collections
+            model, weights, class_table, state.recurrent, obs, mask, collections, training=True
         )
         log_probs = jax.nn.log_softmax(out.logits)
         action = jax.random.categorical(action_key, out.logits)

@@ -42,8 +42,10 @@ def one(chosen, i):
 
 @pytest.fixture(scope="module")
 def triangulating_player(some_rooms, glove, tmp_path_factory):
-    """A player with odometry and triangulation."""
-    network = dataclasses.replace(TINY.network, odometry=True, triangulation=True)
+    """A player with odometry and triangulation, which estimates reach."""
+    network = dataclasses.replace(
+        TINY.network, odometry=True, triangulation=True, reach_threshold=0.5
+    )
     config = dataclasses.replace(TINY, network=network)
     folder = tmp_path_factory.mktemp("runs") / "triangulating"
     save_untrained(config, folder, some_rooms, glove)
@@ -73,7 +75,8 @@ def test_sampled_episodes_come_from_the_probabilities_and_the_stream_of_the_eval
         if not alive:
             break
         logits = np.zeros((len(traces), 6))
-        logits[alive] = np.log([traces[i].probabilities[step] for i in alive])
+        with np.errstate(divide="ignore"):  # of Done out of reach
+            logits[alive] = np.log([traces[i].probabilities[step] for i in alive])
         again = np.asarray(jax.random.categorical(jax.random.fold_in(key, step), logits))
         np.testing.assert_array_equal(again[alive], [traces[i].actions[step] for i in alive])
         drawn += len(alive)
@@ -124,6 +127,25 @@ def test_attention_and_difference_are_those_of_the_printed_equations(
         np.testing.assert_allclose(seen.difference[step], apart, rtol=1e-3, atol=1e-6)
         compared += 1
     assert compared >= 3
+
+
+def test_the_estimate_of_reach_is_told_where_the_target_is_in_view(
+    some_rooms, triangulating_player, chosen
+):
+    told = 0
+    for i in range(6):
+        seen = trace.play(triangulating_player, some_rooms, one(chosen, i))
+        for pose, probability, actions in zip(
+            seen.pose, seen.reach, seen.probabilities, strict=False
+        ):
+            in_view = seen.target in camera_view.of_pose(some_rooms, pose).classes
+            assert np.isfinite(probability) == in_view
+            assert (actions[Action.DONE] > 0) == (in_view and probability >= 0.5)
+            told += in_view
+        page = replay.page([seen], some_rooms)
+        assert page.count('"reach":') == np.isfinite(seen.reach).sum()
+        assert ":NaN" not in page
+    assert told
 
 
 def test_objects_of_a_class_share_the_weight_of_its_merged_row(some_rooms, player, chosen):

@@ -14,7 +14,6 @@ from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import Observation
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output
-from tdanet_jax.models.reach import ReachEstimate
 from tdanet_jax.models.tdanet import TDANetEncoder
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.training import learner
@@ -43,15 +42,15 @@ WORDS = jnp.asarray(samples.words())
 WEIGHTS = samples.parameters(MODEL, WORDS)
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def outputs(model: ActorCritic, obs: Observation) -> Output:
+@functools.partial(jax.jit, static_argnums=(0, 2))
+def outputs(model: ActorCritic, obs: Observation, training: bool = False) -> Output:
     """Policy and value in a batch of first steps."""
     unused = () if model.reach_threshold else ("reach",)
     own = {name: part for name, part in WEIGHTS.items() if name not in unused}
     count = obs.target.shape[0]
     table = actor_critic.prepare(model, own, WORDS)
     state = actor_critic.initial_state(model, own, count)
-    return actor_critic.act(model, own, table, state, obs)[1]
+    return actor_critic.act(model, own, table, state, obs, training=training)[1]
 
 
 def test_done_is_forbidden_out_of_view_and_where_the_target_is_probably_out_of_reach() -> None:
@@ -79,8 +78,11 @@ def test_done_is_forbidden_out_of_view_and_where_the_target_is_probably_out_of_r
     done = out.logits[:, Action.DONE]
     np.testing.assert_array_equal(done[allowed], plain.logits[allowed, Action.DONE])
     probability = np.asarray(jax.nn.softmax(out.logits))[:, Action.DONE]
-    assert probability[~allowed].max() < 1e-15
+    assert not probability[~allowed].any()
     assert probability[allowed].min() > 1e-3
+    in_training = outputs(MODEL, obs, True)
+    np.testing.assert_array_equal(in_training.logits, plain.logits)
+    np.testing.assert_array_equal(in_training.reach, out.reach)
 
 
 def test_no_name_enters_the_estimate() -> None:
@@ -97,8 +99,6 @@ def example() -> tuple[TrainState, Rollout, jax.Array]:
     _, params = house.TASKS[True]
     state = house.begin(jax.random.key(0), house.CONFIG, MODEL, house.WORDS, params)
     changed = samples.randomised(state.params)
-    changed["actor"]["bias"] = changed["actor"]["bias"].at[Action.DONE].add(2.0)
-    changed["reach"]["linear3"]["bias"] += 1.0
     state = state.replace(params=changed)
     _, steps, last = house.rollout(
         state, jax.random.key(1), house.CONFIG, MODEL, house.WORDS, params
@@ -141,6 +141,9 @@ def test_its_loss_is_the_cross_entropy_where_the_target_is_in_view() -> None:
     inputs = (steps.obs, steps.prev_action_probs, steps.is_first, steps.dropout_mask)
     _, out = house.forward(state.params, state.recurrent.carry, *inputs, model=MODEL)
     logits, surprises = np.asarray(out.reach, np.float64), []
+    forbidden = ~np.asarray(steps.obs.target_in_view) | (1 / (1 + np.exp(-logits)) < 0.6)
+    counted = ~np.asarray(steps.bootstrap_only)
+    assert (steps.action == Action.DONE)[counted & forbidden].any(), "it is forbidden in training"
     for index in np.ndindex(*logits.shape):
         seen = np.asarray(steps.obs.classes[index])[np.asarray(steps.obs.mask[index])]
         if bool(steps.bootstrap_only[index]) or int(steps.obs.target[index]) not in seen:
@@ -161,11 +164,6 @@ def test_its_loss_is_the_cross_entropy_where_the_target_is_in_view() -> None:
     mine = grads.pop("reach")
     assert all(np.asarray(leaf).any() for leaf in jax.tree.leaves(mine))
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6), grads, others)
-
-
-def test_at_first_everything_is_within_reach() -> None:
-    logit = ReachEstimate().init_with_output(jax.random.key(0), samples.normal(50, 9))[0]
-    np.testing.assert_array_equal(logit, np.full(50, 2.0))
 
 
 @pytest.mark.slow
