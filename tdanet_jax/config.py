@@ -122,8 +122,8 @@ class NetworkConfig:
     robust_triangulation: bool = False
     """Requires --triangulation, and makes it robust to errors of bearings (docs/noise.md)."""
     reach_threshold: float = 0.0
-    """Requires --triangulation. After training, Done is only allowed where the target is in view and
-    with at least this probability within reach. The probability is estimated from triangulation
+    """Requires --triangulation. After training, Done is only allowed with the target in view, and
+    within reach with this probability or more. The probability is estimated from triangulation
     alone, and therefore for unseen classes, too (docs/method.md). 0: Done is always allowed."""
     scores: bool = False
     """Show the detector's confidence in each detection, 1 without noise. Not in the paper; for

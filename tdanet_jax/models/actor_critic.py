@@ -55,8 +55,8 @@ class ActorCritic(nn.Module):
       dtype: operands of the LSTM's products.
       spec: what the agent is shown. A layer of `SENSOR_UNITS` adds the sensors' features to the
         encoder's; the paper's agent has no sensors.
-      reach_threshold: after training, `Done` is only allowed where the target is in view, and within
-        reach with this estimated probability or more; 0 if there is no estimate.
+      reach_threshold: after training, `Done` is only allowed where the target is in view, and
+        within reach with this estimated probability or more; 0 if there is no estimate.
     """
 
     encoder: Encoder
