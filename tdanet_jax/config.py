@@ -121,10 +121,11 @@ class NetworkConfig:
     detections. Not in the paper; for models that are shown a box of every object."""
     robust_triangulation: bool = False
     """Requires --triangulation, and makes it robust to errors of bearings (docs/noise.md)."""
-    reach_threshold: float = 0.0
+    reach_threshold: float | None = None
     """Requires --triangulation. After training, Done is only allowed with the target in view, and
-    within reach with this probability or more. The probability is estimated from triangulation
-    alone, and therefore for unseen classes, too (docs/method.md). 0: Done is always allowed."""
+    within reach with this probability or more. It is estimated from triangulation alone, and
+    therefore for unseen classes, too (docs/method.md). 0: estimated, but Done is always allowed.
+    None: not estimated."""
     scores: bool = False
     """Show the detector's confidence in each detection, 1 without noise. Not in the paper; for
     models that are shown a box of every object."""
@@ -252,7 +253,7 @@ class TrainConfig:
         sense_noise.parse(self.learner.noise)
         if self.network.robust_triangulation and not self.network.triangulation:
             raise ValueError("--robust-triangulation: needs --triangulation")
-        if self.network.reach_threshold and not self.network.triangulation:
+        if self.network.reach_threshold is not None and not self.network.triangulation:
             raise ValueError("--reach-threshold: needs --triangulation")
         self.network.spec.check()
 
@@ -322,6 +323,9 @@ class EvalConfig:
     noise: str | None = None
     """Senses that err: detector, wheels, mix, or levels such as misses=0.2,jitter=0.1
     (docs/noise.md). The command also takes sweep: five levels of each kind of noise."""
+    reach_threshold: float | None = None
+    """Probability of reach from which Done is allowed, instead of the run's; only for runs that
+    were trained with one. 0 allows Done everywhere."""
 
     def check(self) -> None:
         """Raises ValueError, with one line that names the flag, if a value is out of range."""
@@ -329,6 +333,9 @@ class EvalConfig:
             if value is not None and (not _fits(value, int) or value < 1):
                 raise ValueError(f"--{name} {value}: must be a positive integer")
         sense_noise.parse(self.noise or "none")
+        least = self.reach_threshold
+        if least is not None and not (_fits(least, float) and 0 <= least < 1):
+            raise ValueError(f"--reach-threshold {least}: must be at least 0 and below 1")
 
     @property
     def senses(self) -> SenseNoise:
@@ -342,18 +349,21 @@ class EvalConfig:
         values |= {name: list(getattr(self, name)) for name in ("scenes", "targets")}
         if self.senses.any:
             values["noise"] = str(self.senses)
-        return {name: value for name, value in values.items() if value}
+        departures = {name: value for name, value in values.items() if value}
+        if self.reach_threshold is not None:
+            departures["reach_threshold"] = self.reach_threshold
+        return departures
 
     def locate(self, config: TrainConfig, run: Path | str) -> TrainConfig:
-        """A run's configuration with the files to evaluate it with, and no rooms to train in alone.
+        """A run's configuration as it is evaluated, with its files and no rooms to train in alone.
 
         Args:
           config: the run's.
           run: its folder.
 
         Raises:
-          ValueError: a file that the run was trained with is not where it was; says how to give its
-            new place.
+          ValueError: a file that the run was trained with is not where it was, and the message says
+            how to give its new place; or there is a threshold of reach, but no estimate in the run.
         """
         run = Path(run)
         data = self.data
@@ -365,7 +375,13 @@ class EvalConfig:
                     "place with --data"
                 )
         words = find_word_vectors(config, run, self.word_vectors)
-        return dataclasses.replace(config.in_rooms_alone(), data=data, word_vectors=words)
+        network = config.network
+        if self.reach_threshold is not None:
+            if network.reach_threshold is None:
+                raise ValueError(f"--reach-threshold: {run} was trained without one")
+            network = dataclasses.replace(network, reach_threshold=self.reach_threshold)
+        rooms = config.in_rooms_alone()
+        return dataclasses.replace(rooms, data=data, word_vectors=words, network=network)
 
 
 def describe_departures(departures: Mapping[str, Any]) -> str:
@@ -376,6 +392,7 @@ def describe_departures(departures: Mapping[str, Any]) -> str:
         "scenes": "only in {}",
         "targets": "only for {}",
         "noise": "senses that err, {}",
+        "reach_threshold": "Done from a probability of reach of {}",
     }
     parts = [
         text.format(
@@ -386,7 +403,7 @@ def describe_departures(departures: Mapping[str, Any]) -> str:
             else value
         )
         for name, text in texts.items()
-        if (value := departures.get(name))
+        if (value := departures.get(name)) is not None
     ]
     return f"Not the official test: {'; '.join(parts)}"
 

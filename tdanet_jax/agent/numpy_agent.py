@@ -48,7 +48,7 @@ class Meta:
     hidden: int  # units of the LSTM
     action_units: int  # that embed the previous step's action probabilities
     sensor_units: int  # that embed what the sensors say; 0 without sensors
-    reach_threshold: float  # as in NetworkConfig
+    reach_threshold: float  # as in NetworkConfig; 0 if reach is not estimated, too
     reach_units: int  # of each hidden layer of the estimate of reach; 0 without it
     target_box: tuple[float, ...]  # [F], of the target's row, before its word vector
 
@@ -151,7 +151,8 @@ class NumPyAgent(BaseAgent):
         hidden, cell = self._lstm(features, action_features, state.hidden, state.cell)
         logits = self._layer("actor", hidden)
         reach = self._reach(sensors) if self.meta.reach_units else None
-        if reach is not None and not (goal in labels and reach >= self.meta.reach_threshold):
+        least = self.meta.reach_threshold
+        if reach is not None and least and not (goal in labels and reach >= least):
             logits = without(logits, [Action.DONE])
         probabilities = shown = softmax(logits)
         if forbidden:

@@ -56,7 +56,7 @@ class ActorCritic(nn.Module):
       spec: what the agent is shown. A layer of `SENSOR_UNITS` adds the sensors' features to the
         encoder's; the paper's agent has no sensors.
       reach_threshold: after training, `Done` is only allowed where the target is in view, and
-        within reach with this estimated probability or more; 0 if there is no estimate.
+        within reach with this estimated probability or more; None if there is no estimate.
     """
 
     encoder: Encoder
@@ -64,7 +64,7 @@ class ActorCritic(nn.Module):
     action_width: int = 10
     dtype: Any = jnp.float32
     spec: ObservationSpec = ObservationSpec()
-    reach_threshold: float = 0.0
+    reach_threshold: float | None = None
 
     def setup(self) -> None:
         if self.spec.sensors:
@@ -76,7 +76,7 @@ class ActorCritic(nn.Module):
         small = nn.initializers.variance_scaling(1e-4, "fan_in", "truncated_normal")
         self.actor = Linear(NUM_ACTIONS, kernel_init=small)
         self.critic = Linear(1)
-        if self.reach_threshold:
+        if self.reach_threshold is not None:
             self.reach = ReachEstimate()
 
     def prepare(self, words: jax.Array) -> Any:
@@ -107,7 +107,7 @@ class ActorCritic(nn.Module):
             self.sow("intermediates", "attention", self.encoder.attend(class_table, obs))
         carry, hidden = self.lstm(carry, features, skip_inputs, is_first)
         out = self.decide(hidden)
-        if self.reach_threshold:
+        if self.reach_threshold is not None:
             out = out._replace(reach=self.reach(obs.sensors[self.spec.tracker]))
         return carry, out
 
@@ -216,16 +216,15 @@ def act(
     """
     inputs = (class_table, state.carry, obs, state.prev_action_probs, state.is_first, dropout_mask)
     (carry, out), kept = model.apply({"params": weights}, *inputs, mutable=list(collections))
-    if not training:
-        out = _without_done_out_of_reach(model, obs, out)
+    if model.reach_threshold and not training:
+        out = _without_done_out_of_reach(out, obs, model.reach_threshold)
     after = RecurrentState(carry, jax.nn.softmax(out.logits), jnp.zeros_like(state.is_first))
     return after, out, kept
 
 
-def _without_done_out_of_reach(model: ActorCritic, obs: Observation, out: Output) -> Output:
-    if out.reach is None:
-        return out
-    within = obs.target_in_view & (jax.nn.sigmoid(out.reach) >= model.reach_threshold)
+def _without_done_out_of_reach(out: Output, obs: Observation, threshold: float) -> Output:
+    assert out.reach is not None
+    within = obs.target_in_view & (jax.nn.sigmoid(out.reach) >= threshold)
     done = jnp.where(within, out.logits[..., Action.DONE], FORBIDDEN)
     return out._replace(logits=out.logits.at[..., Action.DONE].set(done))
 

@@ -156,7 +156,7 @@ def rollout(
         lambda x: x.astype(model.dtype) if x.ndim > 1 and x.size > SMALL else x, state.params
     )
     class_table = actor_critic.prepare(model, state.params, words)
-    rate = model.encoder.dropout
+    rate, estimated = model.encoder.dropout, model.reach_threshold is not None
     batch, units = config.num_envs, model.encoder.dropout_units
     # The cache holds for the parameters that acted, and so for the first optimiser step alone.
     collections = (ACTIVATIONS,) if config.optimizer_steps == 1 else ()
@@ -192,7 +192,7 @@ def rollout(
             success=moved.success & ~only,
             length=moved.state.steps,
             shortest=state.env_state.shortest,
-            within_reach=within_reach(state.env_state) if model.reach_threshold else None,
+            within_reach=within_reach(state.env_state) if estimated else None,
         )
         following = state.replace(
             env_state=dynamics.choose(terminal, begun, moved.state),

@@ -91,8 +91,8 @@ def _write_agent(agent: Agent, word_vectors: str | None, folder: Path) -> None:
         "hidden": network.hidden,
         "action_units": agent.model.action_width,
         "sensor_units": SENSOR_UNITS if spec.sensors else 0,
-        "reach_threshold": float(network.reach_threshold),
-        "reach_units": reach.UNITS if network.reach_threshold else 0,
+        "reach_threshold": float(network.reach_threshold or 0),
+        "reach_units": 0 if network.reach_threshold is None else reach.UNITS,
         "target_box": TARGET_BOX[: spec.columns],
     }
     weights = traverse_util.flatten_dict(jax.device_get(agent.weights), sep="/")

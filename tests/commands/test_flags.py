@@ -305,6 +305,7 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--scenes": "--scenes FloorPlan21",
             "--targets": "--targets Mug",
             "--noise": "--noise mix",
+            "--reach-threshold": "--reach-threshold 0.5",
             "--seed": "--seed 5",
             "--out": "--out new",
         },

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -20,6 +21,8 @@ from tdanet_jax.evaluation import comparison, episodes, selection
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.splits import make_split
+from tdanet_jax.words import WordVectors
+from tests.conftest import TINY, save_untrained
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +148,37 @@ def test_the_results_say_that_it_is_not_the_test(
     assert len(records) == 20
     assert all(record["success"] == (record["L"] <= 3) for record in records)
     assert max(record["e"] for record in records) == 3
+
+
+def test_a_run_is_evaluated_with_another_threshold_of_reach(
+    ithor: SceneTables, glove: WordVectors, tmp_path: Path
+) -> None:
+    network = dataclasses.replace(
+        TINY.network, odometry=True, triangulation=True, reach_threshold=0.7
+    )
+    run = tmp_path / "run"
+    save_untrained(dataclasses.replace(TINY, network=network), run, ithor, glove)
+    ended = {}
+    for threshold in (0.0, 0.999):
+        out = tmp_path / str(threshold)
+        test = EvalConfig(episodes=30, step_limit=20, reach_threshold=threshold)
+        tdanet_jax.evaluate(run, test=test, out=out)
+        said = f"Done from a probability of reach of {threshold}"
+        assert said in (out / "results.md").read_text()
+        records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+        ended[threshold] = sum(record["actions"][-1] == "Done" for record in records)
+    assert ended[0.0] > 10
+    assert ended[0.999] == 0
+
+
+def test_a_threshold_needs_an_estimate_of_reach(opinionated_run: Path) -> None:
+    test = EvalConfig(reach_threshold=0.5)
+    with pytest.raises(ValueError, match=r"--reach-threshold: .*my-run was trained without"):
+        tdanet_jax.evaluate(opinionated_run, test=test)
+    with pytest.raises(ValueError, match="--reach-threshold: needs a checkpoint"):
+        tdanet_jax.evaluate(policy="random", test=test)
+    with pytest.raises(ValueError, match="--reach-threshold 1: must be at least 0 and below 1"):
+        tdanet_jax.evaluate(opinionated_run, test=EvalConfig(reach_threshold=1))
 
 
 def test_a_page_on_several_networks_says_so_too() -> None:

@@ -47,7 +47,7 @@ FAULTS = (
           "agent/test_agent.py"),
     Fault("Done where the target is out of view", "models/actor_critic.py",
           "obs.target_in_view & (jax", "(jax", "training/test_reach.py"),
-    Fault("Done out of reach", "models/actor_critic.py", "if not training:", "if False:",
+    Fault("Done out of reach", "models/actor_critic.py", "if model.reach_threshold and not training:", "if False:",
           "training/test_reach.py"),
     Fault("Done is forbidden in training", LEARNER, "collections, training=True", "collections",
           "training/test_reach.py"),
