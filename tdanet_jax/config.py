@@ -527,7 +527,7 @@ PAPER = TrainConfig(
 #: What did best on validation, with sensors that the paper does not have (docs/results.md).
 BEST = TrainConfig(
     learner=LearnerConfig(gamma=0.97, size_noise=0.5),
-    network=NetworkConfig(odometry=True, triangulation=True),
+    network=NetworkConfig(odometry=True, triangulation=True, reach_threshold=0.5),
 )
 #: For robots: BEST with senses that err in training, by up to twice the levels of `mix`, and by up
 #: to 3 degrees of heading, which cost more than all else (docs/noise.md).
@@ -539,7 +539,9 @@ ROBUST = dataclasses.replace(
             dataclasses.replace(sense_noise.up_to(sense_noise.MIX, 2), heading_error=(0.0, 3.0))
         ),
     ),
-    network=dataclasses.replace(BEST.network, robust_triangulation=True, scores=True),
+    network=dataclasses.replace(
+        BEST.network, robust_triangulation=True, scores=True, reach_threshold=None
+    ),
 )
 PRESETS = {"default": TrainConfig(), "best": BEST, "robust": ROBUST, "paper": PAPER}
 
