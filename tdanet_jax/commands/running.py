@@ -32,8 +32,7 @@ class Command:
     """Defaults of the other flags. best: --odometry, --triangulation, --reach-threshold 0.5,
     --gamma 0.97 and --size-noise 0.5, which did best on validation. robust: the same without
     --reach-threshold, with --robust-triangulation, --scores and --noise, for robots, whose senses
-    err. paper: the reference implementation's
-    hyperparameters and its budget of 6 M episodes."""
+    err. paper: the reference implementation's hyperparameters and its budget of 6 M episodes."""
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""
     resume: Path | None = None

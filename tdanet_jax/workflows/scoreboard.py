@@ -22,7 +22,7 @@ import numpy as np
 
 from tdanet_jax import config as configs
 from tdanet_jax.analysis import episode_lookup
-from tdanet_jax.config import CONFIG_FILE, PRESETS, TrainConfig, describe_departures
+from tdanet_jax.config import BUDGETS, CONFIG_FILE, PRESETS, TrainConfig, describe_departures
 from tdanet_jax.evaluation import comparison, episodes, metrics, report, results_file, rollout
 from tdanet_jax.evaluation.comparison import Result
 from tdanet_jax.evaluation.policies import Policy
@@ -101,10 +101,11 @@ def _differing(config: TrainConfig, preset: TrainConfig) -> list[str]:
     A limit of the preset that it has not is left out: another one takes its place.
     """
     values, usual = comparison.flags(config), comparison.flags(preset)
+    absent = {f"--{name}" for name in BUDGETS if getattr(config, name) is None}
     return [
         _typed(flag, value)
         for flag, value in values.items()
-        if flag not in _SHARED and value is not None and value != usual[flag]
+        if flag not in {*_SHARED, *absent} and value != usual[flag]
     ]
 
 
