@@ -254,7 +254,9 @@ class TrainConfig:
         if self.network.robust_triangulation and not self.network.triangulation:
             raise ValueError("--robust-triangulation: needs --triangulation")
         if self.network.reach_threshold is not None and not self.network.triangulation:
-            raise ValueError("--reach-threshold: needs --triangulation")
+            raise ValueError(
+                "--reach-threshold: needs --triangulation (or use --reach-threshold None)"
+            )
         self.network.spec.check()
 
     def in_rooms_alone(self) -> TrainConfig:
@@ -378,7 +380,7 @@ class EvalConfig:
         network = config.network
         if self.reach_threshold is not None:
             if network.reach_threshold is None:
-                raise ValueError(f"--reach-threshold: {run} was trained without one")
+                raise ValueError(f"--reach-threshold: {run} was trained without it")
             network = dataclasses.replace(network, reach_threshold=self.reach_threshold)
         rooms = config.in_rooms_alone()
         return dataclasses.replace(rooms, data=data, word_vectors=words, network=network)
@@ -392,7 +394,7 @@ def describe_departures(departures: Mapping[str, Any]) -> str:
         "scenes": "only in {}",
         "targets": "only for {}",
         "noise": "senses that err, {}",
-        "reach_threshold": "Done from a probability of reach of {}",
+        "reach_threshold": "Done with a probability of reach of {} or more",
     }
     parts = [
         text.format(

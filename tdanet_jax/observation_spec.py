@@ -12,7 +12,7 @@ from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.registry import SENSORS
 
 #: Sensors that track the target by its boxes.
-_TRACKING = ("triangulation", "robust-triangulation")
+TRACKING = ("triangulation", "robust-triangulation")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +42,7 @@ class ObservationSpec:
     @property
     def tracker(self) -> str:
         """The sensor that tracks the target; "" if there is none."""
-        return next((name for name in self.sensors if name in _TRACKING), "")
+        return next((name for name in self.sensors if name in TRACKING), "")
 
     def agent_name(self, model: str) -> str:
         """A model's name, and what it senses unlike the paper's agents: tdanet, --odometry."""
@@ -60,7 +60,7 @@ class ObservationSpec:
                 raise ValueError(
                     f"--sensors {name}: choose among {', '.join(SENSORS)}, or name a module"
                 )
-        tracking = [i for i, name in enumerate(self.sensors) if name in _TRACKING]
+        tracking = [i for i, name in enumerate(self.sensors) if name in TRACKING]
         if tracking and "odometry" not in self.sensors[: tracking[0]]:
             raise ValueError("--triangulation: needs --odometry (or use --no-triangulation)")
         for flag in ["triangulation"] * bool(tracking) + ["scores"] * self.scores:

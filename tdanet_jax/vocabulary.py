@@ -22,6 +22,8 @@ class Action(IntEnum):
 
 ACTION_NAMES = ("MoveAhead", "RotateLeft", "RotateRight", "LookUp", "LookDown", "Done")
 NUM_ACTIONS = len(ACTION_NAMES)
+#: The logit of `Done` where the estimate of reach forbids it: below all but what a caller forbids.
+OUT_OF_REACH = -1e9
 
 #: Settings of AI2-THOR.
 VISIBILITY_DISTANCE = 1.5  # metres, horizontal, within which an object can be visible

@@ -18,7 +18,7 @@ import numpy as np
 
 from tdanet_jax import config as configs
 from tdanet_jax import words
-from tdanet_jax.agent.base import BaseAgent, Decision, softmax, without
+from tdanet_jax.agent.base import BaseAgent, Decision, sigmoid, softmax, without
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors
 from tdanet_jax.env.types import Observation
@@ -279,7 +279,10 @@ class Agent(BaseAgent):
         blocked: jax.Array,
         pose: MeasuredPose | None,
     ) -> tuple[AgentState, Output, jax.Array | None]:
-        """The state but for the next action, policy and value, and the attention."""
+        """The state but for the next action, policy and value, and the attention.
+
+        The logit of reach is NaN where the target is not in view.
+        """
         spec = self.spec
         frame = Frame(obs.classes[0], obs.boxes[0], obs.mask[0], obs.target[0])
         sensors = suite.update(
@@ -292,6 +295,9 @@ class Agent(BaseAgent):
             self.model, weights, class_table, state.recurrent, obs.replace(sensors=readings),
             collections=("intermediates",),
         )  # fmt: skip
+        if out.reach_logit is not None:
+            logit = jnp.where(obs.target_in_view, out.reach_logit, jnp.nan)
+            out = out._replace(reach_logit=logit)
         (attention,) = kept["intermediates"]["attention"]
         return AgentState(recurrent, state.action, sensors, frame.target), out, attention
 
@@ -314,14 +320,18 @@ def _decision(
     probabilities = np.asarray(state.recurrent.prev_action_probs)[0]
     if forbidden:
         logits = without(logits, forbidden)
+    if forbidden or out.reach_logit is not None:
         probabilities = softmax(logits)
+    reach = None
+    if out.reach_logit is not None and np.isfinite(logit := np.asarray(out.reach_logit)[0]):
+        reach = float(sigmoid(logit))
     action = Action(int(np.argmax(logits) if key is None else _sample(key, logits)))
     decision = Decision(
         action=action,
         probabilities=probabilities,
         value=float(np.asarray(out.value)[0]),
         attention=None if attention is None else np.asarray(attention)[0][owner],
-        reach=None if out.reach is None else float(1 / (1 + np.exp(-np.asarray(out.reach)[0]))),
+        reach=reach,
     )
     return state._replace(action=np.int32(action)), decision
 

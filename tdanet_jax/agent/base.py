@@ -26,13 +26,18 @@ class Decision(NamedTuple):
     probabilities: np.ndarray  # [6], in the order of `Action`; 0 for what is forbidden
     value: float  # expected discounted return
     attention: np.ndarray | None  # [n], weight of each detection; None if the model has none
-    reach: float | None = None  # probability that the target, if in view, is within 1.5 m
+    reach: float | None = None  # probability of the target in view being within 1.5 m, if estimated
 
 
 def softmax(x: np.ndarray) -> np.ndarray:
     """Probabilities from logits, [n]."""
     exponentials = np.exp(x - x.max())
     return exponentials / exponentials.sum()
+
+
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    """The probability from a logit."""
+    return (1 + np.tanh(x / 2)) / 2  # for large x of either sign, too
 
 
 def without(logits: np.ndarray, forbidden: Collection[Action]) -> np.ndarray:

@@ -18,15 +18,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tdanet_jax import words
-from tdanet_jax.agent.base import BaseAgent, Decision, softmax, without
+from tdanet_jax.agent.base import BaseAgent, Decision, sigmoid, softmax, without
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.io.untrusted import FileError, npz
 from tdanet_jax.labels import Synonyms
-from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.observation_spec import TRACKING, ObservationSpec
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.sensors import numpy_sensors
 from tdanet_jax.sensors.shared import MeasuredPose
-from tdanet_jax.vocabulary import NUM_ACTIONS, Action
+from tdanet_jax.vocabulary import NUM_ACTIONS, OUT_OF_REACH, Action
 from tdanet_jax.words import WordVectors
 
 #: Files of an exported agent: what it is shown, its parameters, and its words.
@@ -150,11 +150,13 @@ class NumPyAgent(BaseAgent):
         action_features = _relu(self._layer("action_embedding", state.probabilities))
         hidden, cell = self._lstm(features, action_features, state.hidden, state.cell)
         logits = self._layer("actor", hidden)
-        reach = self._reach(sensors) if self.meta.reach_units else None
-        least = self.meta.reach_threshold
-        if reach is not None and least and not (goal in labels and reach >= least):
-            logits = without(logits, [Action.DONE])
         probabilities = shown = softmax(logits)
+        reach = None
+        if self.meta.reach_units:
+            reach = self._reach(sensors) if goal in labels else None
+            if (reach or 0.0) < self.meta.reach_threshold:
+                logits[Action.DONE] = OUT_OF_REACH
+                shown = softmax(logits)
         if forbidden:
             logits = without(logits, forbidden)
             shown = softmax(logits)
@@ -207,11 +209,11 @@ class NumPyAgent(BaseAgent):
         return attention, _relu(self._layer("encoder/linear4", third))
 
     def _reach(self, sensors: numpy_sensors.States) -> float:
-        """How probable it is that the target, if in view, is within reach (`models.reach`)."""
+        """How probable it is that the target, being in view, is within reach (`models.reach`)."""
         reading = numpy_sensors.read(self.spec, sensors)[self.spec.tracker]
         hidden = _relu(self._layer("reach/linear1", reading))
         hidden = _relu(self._layer("reach/linear2", hidden))
-        return float(_sigmoid(self._layer("reach/linear3", hidden))[0])
+        return float(sigmoid(self._layer("reach/linear3", hidden))[0])
 
     def _branch(self, inputs: np.ndarray) -> np.ndarray:
         first = _relu(self._layer("encoder/linear1", inputs))
@@ -225,8 +227,8 @@ class NumPyAgent(BaseAgent):
         gates = gates + skip @ self.weights["lstm/kernel_skip"]
         gates = gates + self.weights["lstm/bias_ih"] + self.weights["lstm/bias_hh"]
         i, f, g, o = np.split(gates, 4)
-        cell = _sigmoid(f) * cell + _sigmoid(i) * np.tanh(g)
-        return _sigmoid(o) * np.tanh(cell), cell
+        cell = sigmoid(f) * cell + sigmoid(i) * np.tanh(g)
+        return sigmoid(o) * np.tanh(cell), cell
 
     def _layer(self, name: str, inputs: np.ndarray) -> np.ndarray:
         return inputs @ self.weights[f"{name}/kernel"] + self.weights[f"{name}/bias"]
@@ -303,6 +305,8 @@ def _read_meta(path: Path) -> Meta:
             raise FileError(path, f"{name} is not a name")
     if unknown := {*values["sensors"]} - {*numpy_sensors.WIDTHS}:
         raise FileError(path, f"no sensor is called {min(unknown)}")
+    if values["reach_units"] and not {*TRACKING} & {*values["sensors"]}:
+        raise FileError(path, "reach_units: needs triangulation among the sensors")
     lists = {name: tuple(values[name]) for name, kind in _KINDS.items() if kind is list}
     return Meta(**{name: values[name] for name in _KINDS} | lists)
 
@@ -318,7 +322,3 @@ def _read_json(path: Path) -> Any:
 
 def _relu(x: np.ndarray) -> np.ndarray:
     return np.maximum(x, 0)
-
-
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return (1 + np.tanh(x / 2)) / 2  # for large x of either sign, too

@@ -284,14 +284,14 @@ def _network(
         obs = jax.tree.map(lambda x: x[None], dynamics.observe(state, params))
         recurrent, out, frame = attention.act(model, weights, class_table, recurrent, obs)
         computed = _NetworkSteps(
-            probabilities=recurrent.prev_action_probs,
+            probabilities=jax.nn.softmax(out.logits),
             value=out.value,
             attention=frame.attention,
             correspondence=frame.correspondence,
             difference=None if frame.difference is None else frame.difference.mean(-1),
             reach=None
-            if out.reach is None
-            else jnp.where(obs.target_in_view, jax.nn.sigmoid(out.reach), jnp.nan),
+            if out.reach_logit is None
+            else jnp.where(obs.target_in_view, jax.nn.sigmoid(out.reach_logit), jnp.nan),
         )
         state = dynamics.transition(state, action, params).state
         return (state, recurrent), jax.tree.map(lambda x: x[0], computed)

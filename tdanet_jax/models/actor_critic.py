@@ -15,10 +15,10 @@ from tdanet_jax.models.activation_cache import ACTIVATIONS
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import Linear
 from tdanet_jax.models.lstm import LSTM, Carry
-from tdanet_jax.models.reach import FORBIDDEN, ReachEstimate
+from tdanet_jax.models.reach import ReachEstimate, mask_done
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.sensors import suite
-from tdanet_jax.vocabulary import NUM_ACTIONS, Action
+from tdanet_jax.vocabulary import NUM_ACTIONS
 
 #: Units of the layer that embeds the sensors' features.
 SENSOR_UNITS = 64
@@ -29,7 +29,7 @@ class Output(NamedTuple):
 
     logits: jax.Array  # [..., 6], unnormalised log-probabilities of the actions
     value: jax.Array  # [...], expected discounted return
-    reach: jax.Array | None = None  # [...], logit of the target being within reach, if estimated
+    reach_logit: jax.Array | None = None  # [...], of the target being within reach, if estimated
 
 
 class RecurrentState(struct.PyTreeNode):
@@ -108,7 +108,7 @@ class ActorCritic(nn.Module):
         carry, hidden = self.lstm(carry, features, skip_inputs, is_first)
         out = self.decide(hidden)
         if self.reach_threshold is not None:
-            out = out._replace(reach=self.reach(obs.sensors[self.spec.tracker]))
+            out = out._replace(reach_logit=self.reach(obs.sensors[self.spec.tracker]))
         return carry, out
 
     def perceive(
@@ -209,24 +209,19 @@ def act(
     Args:
       collections: Flax collections to return: `ACTIVATIONS` while training, "intermediates" for the
         attention, its logits and the Siamese difference.
-      training: whether `Done` is allowed out of reach, too.
+      training: the rule on `Done` (`reach_threshold`) is not applied.
 
     Returns:
-      The state after the step, policy and value, and the collections by name.
+      The state after the step, policy and value, and the collections by name. The state remembers
+      the probabilities without the rule, as in training.
     """
     inputs = (class_table, state.carry, obs, state.prev_action_probs, state.is_first, dropout_mask)
     (carry, out), kept = model.apply({"params": weights}, *inputs, mutable=list(collections))
-    if model.reach_threshold and not training:
-        out = _without_done_out_of_reach(out, obs, model.reach_threshold)
     after = RecurrentState(carry, jax.nn.softmax(out.logits), jnp.zeros_like(state.is_first))
+    if model.reach_threshold and not training:
+        logits = mask_done(out.logits, out.reach_logit, obs.target_in_view, model.reach_threshold)
+        out = out._replace(logits=logits)
     return after, out, kept
-
-
-def _without_done_out_of_reach(out: Output, obs: Observation, threshold: float) -> Output:
-    assert out.reach is not None
-    within = obs.target_in_view & (jax.nn.sigmoid(out.reach) >= threshold)
-    done = jnp.where(within, out.logits[..., Action.DONE], FORBIDDEN)
-    return out._replace(logits=out.logits.at[..., Action.DONE].set(done))
 
 
 def forward(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary
+from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
 from tdanet_jax.registry import MODELS, find_make
 from tdanet_jax.sensors import suite
 
@@ -41,6 +42,8 @@ def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
         sensors=tuple(dict.fromkeys((*asked.sensors, *model.spec.sensors))),
     )
     spec.check(config.model)
+    if network.reach_threshold is not None and isinstance(model, AdaptiveActorCritic):
+        raise ValueError(f"--reach-threshold: not with {config.model}, which adapts while it acts")
     suite.make(spec)  # a sensor that cannot be made is refused here, too
     return model.clone(spec=spec, reach_threshold=network.reach_threshold)
 

@@ -1,7 +1,7 @@
 """Whether the target is within reach, estimated without knowing what it is.
 
 An agent learns how large a class looks where a `Done` succeeds, and misjudges classes that it was
-never trained to find: most of its failures on them are a `Done` too far away. Triangulation tells
+never trained to find: many of its failures on them are a `Done` too far away. Triangulation tells
 where the target seems to be, how large it is and how certain that is. From these numbers alone, two
 hidden layers estimate how probable it is that the target in view is within reach. They are trained
 with the agent, on what is within reach in the training rooms; as no name enters, the estimate
@@ -14,17 +14,17 @@ both must agree.
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 from flax import linen as nn
 
 from tdanet_jax.models.layers import Linear
+from tdanet_jax.vocabulary import OUT_OF_REACH, Action
 
 #: Units of each hidden layer.
 UNITS = 64
 #: The estimate's weight in the loss. The size of Adam's steps does not depend on it, for nothing
 #: else trains these parameters; but gradients are clipped together, where it should count little.
 WEIGHT = 0.1
-#: The logit of `Done` where it is not allowed.
-FORBIDDEN = -1e9
 
 
 class ReachEstimate(nn.Module):
@@ -38,3 +38,19 @@ class ReachEstimate(nn.Module):
     def __call__(self, reading: jax.Array) -> jax.Array:
         """[..., 9] -> [...]."""
         return self.linear3(nn.relu(self.linear2(nn.relu(self.linear1(reading)))))[..., 0]
+
+
+def mask_done(
+    logits: jax.Array, reach_logit: jax.Array, in_view: jax.Array, threshold: float
+) -> jax.Array:
+    """The logits [..., 6] without `Done` where the target is not in view or probably out of reach.
+
+    Args:
+      logits: of the actions.
+      reach_logit: [...], of the target being within reach.
+      in_view: [...] bool, whether the target is in view.
+      threshold: the least probability of reach with which `Done` is allowed.
+    """
+    allowed = in_view & (jax.nn.sigmoid(reach_logit) >= threshold)
+    done = jnp.where(allowed, logits[..., Action.DONE], OUT_OF_REACH)
+    return logits.at[..., Action.DONE].set(done)

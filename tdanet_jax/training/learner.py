@@ -205,7 +205,7 @@ def rollout(
     state = state.replace(recurrent=state.recurrent.replace(carry=carry))
     after, steps = jax.lax.scan(act, state, jax.random.split(key, config.rollout_steps))
     obs = observe(after.env_state, params)
-    _, out, _ = actor_critic.act(model, weights, class_table, after.recurrent, obs)
+    _, out, _ = actor_critic.act(model, weights, class_table, after.recurrent, obs, training=True)
     return after, steps, out.value
 
 
@@ -235,8 +235,8 @@ def loss(
     )
     counted = ~steps.bootstrap_only
 
-    def mean(x: jax.Array, among: jax.Array = counted) -> jax.Array:
-        return jnp.sum(jnp.where(among, x, 0.0)) / jnp.maximum(among.sum(), 1)
+    def mean(x: jax.Array, where: jax.Array = counted) -> jax.Array:
+        return jnp.sum(jnp.where(where, x, 0.0)) / jnp.maximum(where.sum(), 1)
 
     log_probs = jax.nn.log_softmax(out.logits)
     log_prob = jnp.take_along_axis(log_probs, steps.action[..., None], -1)[..., 0]
@@ -250,9 +250,9 @@ def loss(
     value_loss = mean(0.5 * (steps.value + advantage - out.value) ** 2)
     total = policy_loss + config.value_weight * value_loss - entropy_weight * entropy
     parts = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
-    if out.reach is not None:
-        surprise = optax.sigmoid_binary_cross_entropy(out.reach, steps.within_reach)
-        parts["reach_loss"] = mean(surprise, counted & steps.obs.target_in_view)
+    if out.reach_logit is not None:
+        cross_entropy = optax.sigmoid_binary_cross_entropy(out.reach_logit, steps.within_reach)
+        parts["reach_loss"] = mean(cross_entropy, counted & steps.obs.target_in_view)
         total += reach.WEIGHT * parts["reach_loss"]
     return total, parts
 

@@ -286,7 +286,8 @@ class Run:
             "spl": per_episode("spl_sum"),
             "length": per_episode("length_sum"),
             "reward": float(metrics["reward_sum"].sum()) / steps,
-            **{name: over_updates(name) for name in _UPDATE_MEANS if name in metrics},
+            **{name: over_updates(name) for name in _UPDATE_MEANS},
+            **{name: over_updates(name) for name in _ESTIMATE_MEANS if name in metrics},
             "bootstrap_only_steps": int(metrics["bootstrap_only_steps"].sum()),
             "skipped": int(self.state.skipped),
             "seconds": round(self.seconds, 3),
@@ -361,8 +362,8 @@ def _chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
             run._check_finite()
 
 
-#: Means over updates; there is a `reach_loss` if the network estimates reach.
 _UPDATE_MEANS = (
-    "policy_loss", "value_loss", "entropy", "reach_loss", "explained_variance", "grad_norm",
-    "learning_rate",
+    "policy_loss", "value_loss", "entropy", "explained_variance", "grad_norm", "learning_rate",
 )  # fmt: skip
+#: Of networks that estimate reach.
+_ESTIMATE_MEANS = ("reach_loss",)

@@ -93,13 +93,36 @@ def test_it_decides_as_in_jax(preset, glove, tmp_path):
         np.testing.assert_allclose(found.probabilities, expected.probabilities, atol=loose)
         np.testing.assert_allclose(found.value, expected.value, atol=10 * loose)
         np.testing.assert_allclose(found.attention, expected.attention, atol=1e-5)
-        assert (found.reach is None) == (preset != "robust")
+        assert (found.reach is None) == (expected.reach is None)
+        if preset == "robust":
+            assert (found.reach is None) == (target not in {one.label for one in seen})
+            may = found.reach is not None and found.reach >= 0.5
+            assert (found.probabilities[Action.DONE] > 0) == may
+            reached.add(found.reach and may)
         if found.reach is not None:
             np.testing.assert_allclose(found.reach, expected.reach, atol=loose)
-            may = found.reach >= 0.5 and target in {one.label for one in seen}
-            assert may or not found.probabilities[Action.DONE]
-            reached.add(may)
-    assert preset != "robust" or reached == {True, False}
+    assert reached == ({True, False, None} if preset == "robust" else set())
+
+
+@pytest.mark.parametrize("sampled", [True, False])
+def test_if_all_else_is_forbidden_it_is_done_out_of_reach(glove, tmp_path, sampled):
+    theirs = small_agent(glove, **NETWORKS["robust"])
+    others = [action for action in Action if action != Action.DONE]
+    for agent in (theirs, numpy_agent.load(exported(theirs, tmp_path / "out"))):
+        key = agent.key(0, 0) if sampled else None
+        _, decision = agent.act(agent.start(), [], "mug", key, forbidden=others)
+        assert decision.action == Action.DONE
+        np.testing.assert_array_equal(decision.probabilities, [0, 0, 0, 0, 0, 1])
+
+
+def test_a_folder_of_an_older_version_has_no_estimate_of_reach(folder, tmp_path):
+    older = shutil.copytree(folder, tmp_path / "older")
+    meta = json.loads((older / "meta.json").read_text())
+    assert (meta.pop("reach_threshold"), meta.pop("reach_units")) == (0.0, 0)
+    (older / "meta.json").write_text(json.dumps(meta))
+    agent = numpy_agent.load(older)
+    seen = [Detection("mug", 0.1, 0.1, 0.3, 0.4)]
+    assert agent.act(agent.start(), seen, "mug")[1].reach is None
 
 
 def test_a_navigator_runs_it(folder):
@@ -127,6 +150,13 @@ def test_a_navigator_runs_it(folder):
         ("meta.json", lambda text: text.replace('"hidden": 16', '"hidden": "x"'), "hidden is miss"),
         ("meta.json", lambda text: text.replace('"hidden": 16', '"hidden": 8'), "actor/kernel is"),
         ("meta.json", lambda text: text.replace('"odometry"', '"os.path"'), "no sensor is called"),
+        (
+            "meta.json",
+            lambda text: text.replace('"reach_units": 0', '"reach_units": 8').replace(
+                "triangulation", "odometry"
+            ),
+            "reach_units: needs triangulation",
+        ),
         ("model.npz", None, r"model\.npz: no such file"),
         ("words.npz", None, r"words\.npz: no such file"),
         ("meta.json", None, r"meta\.json: No such file"),

@@ -163,7 +163,7 @@ def test_a_run_is_evaluated_with_another_threshold_of_reach(
         out = tmp_path / str(threshold)
         test = EvalConfig(episodes=30, step_limit=20, reach_threshold=threshold)
         tdanet_jax.evaluate(run, test=test, out=out)
-        said = f"Done from a probability of reach of {threshold}"
+        said = f"Done with a probability of reach of {threshold} or more"
         assert said in (out / "results.md").read_text()
         records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
         ended[threshold] = sum(record["actions"][-1] == "Done" for record in records)
@@ -173,7 +173,7 @@ def test_a_run_is_evaluated_with_another_threshold_of_reach(
 
 def test_a_threshold_needs_an_estimate_of_reach(opinionated_run: Path) -> None:
     test = EvalConfig(reach_threshold=0.5)
-    with pytest.raises(ValueError, match=r"--reach-threshold: .*my-run was trained without"):
+    with pytest.raises(ValueError, match=r"--reach-threshold: .*my-run was trained without it"):
         tdanet_jax.evaluate(opinionated_run, test=test)
     with pytest.raises(ValueError, match="--reach-threshold: needs a checkpoint"):
         tdanet_jax.evaluate(policy="random", test=test)

@@ -368,9 +368,12 @@ def test_rooms_and_what_they_give_are_drawn(
 def test_an_agent_is_called_by_its_flags() -> None:
     row, paper = scoreboard.read(RESULTS / "18-4-best-0"), PRESETS["paper"]
     assert row.agent == "tdanet --preset best"
-    network = dataclasses.replace(BEST.network, triangulation=False)
+    network = dataclasses.replace(BEST.network, triangulation=False, reach_threshold=None)
     for config, agent in (
-        (dataclasses.replace(BEST, network=network), "tdanet --preset best --no-triangulation"),
+        (
+            dataclasses.replace(BEST, network=network),
+            "tdanet --preset best --no-triangulation --reach-threshold None",
+        ),
         (
             dataclasses.replace(paper, episodes=None, minutes=9.0),
             "tdanet --preset paper --minutes 9.0",

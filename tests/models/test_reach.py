@@ -60,13 +60,13 @@ def test_done_is_forbidden_out_of_view_and_where_the_target_is_probably_out_of_r
         bool((np.asarray(classes) == target)[np.asarray(mask)].any())
         for classes, mask, target in zip(obs.classes, obs.mask, obs.target, strict=True)
     ]
-    assert plain.reach is None
+    assert plain.reach_logit is None
     layers = jax.device_get(WEIGHTS["reach"])
     hidden = np.asarray(obs.sensors["triangulation"], np.float64)
     for name in ("linear1", "linear2"):
         hidden = np.maximum(hidden @ layers[name]["kernel"] + layers[name]["bias"], 0)
     logit = (hidden @ layers["linear3"]["kernel"] + layers["linear3"]["bias"])[:, 0]
-    np.testing.assert_allclose(out.reach, logit, atol=1e-5)
+    np.testing.assert_allclose(out.reach_logit, logit, atol=1e-5)
     probable = 1 / (1 + np.exp(-logit)) >= 0.6
     allowed = np.array(in_view) & probable
     assert {(bool(v), bool(p)) for v, p in zip(in_view, probable, strict=True)} == {
@@ -82,14 +82,14 @@ def test_done_is_forbidden_out_of_view_and_where_the_target_is_probably_out_of_r
     assert probability[allowed].min() > 1e-3
     in_training = outputs(MODEL, obs, True)
     np.testing.assert_array_equal(in_training.logits, plain.logits)
-    np.testing.assert_array_equal(in_training.reach, out.reach)
+    np.testing.assert_array_equal(in_training.reach_logit, out.reach_logit)
 
 
 def test_no_name_enters_the_estimate() -> None:
     obs = frames(60)
     renamed = obs.replace(classes=(obs.classes + 1) % 9, target=(obs.target + 1) % 9)
     one, other = outputs(MODEL, obs), outputs(MODEL, renamed)
-    np.testing.assert_array_equal(one.reach, other.reach)
+    np.testing.assert_array_equal(one.reach_logit, other.reach_logit)
     assert (np.asarray(one.value) != np.asarray(other.value)).any()
 
 
@@ -140,7 +140,7 @@ def test_its_loss_is_the_cross_entropy_where_the_target_is_in_view() -> None:
     (loss, parts), grads = jax.jit(jax.value_and_grad(total, has_aux=True))(state.params)
     inputs = (steps.obs, steps.prev_action_probs, steps.is_first, steps.dropout_mask)
     _, out = house.forward(state.params, state.recurrent.carry, *inputs, model=MODEL)
-    logits, surprises = np.asarray(out.reach, np.float64), []
+    logits, surprises = np.asarray(out.reach_logit, np.float64), []
     forbidden = ~np.asarray(steps.obs.target_in_view) | (1 / (1 + np.exp(-logits)) < 0.6)
     counted = ~np.asarray(steps.bootstrap_only)
     assert (steps.action == Action.DONE)[counted & forbidden].any(), "it is forbidden in training"
