@@ -77,7 +77,9 @@ class Evaluated:
             "updates": self.snapshot.updates,
             "training_seconds": round(self.snapshot.seconds, 1),
             **report.results(self.provenance, self.task.tables, self.played),
-            "settings": comparison.settings(self.saved.config),
+            "settings": comparison.settings(
+                dataclasses.replace(self.saved.config, network=self.saved.located.network)
+            ),
         }
 
     def columns(self) -> dict[str, report.Columns]:

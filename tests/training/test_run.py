@@ -62,7 +62,7 @@ def run_whole(folder, config, task):
 
 @pytest.fixture(scope="module")
 def sensing_whole(ithor, tmp_path_factory):
-    """The same, of an agent that senses its way, and where its target is and whether within reach."""
+    """The same, of an agent that senses its way and its target, and estimates reach."""
     network = dataclasses.replace(
         TINY.network, odometry=True, triangulation=True, reach_threshold=0.5
     )
