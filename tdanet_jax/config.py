@@ -335,9 +335,6 @@ class EvalConfig:
             if value is not None and (not _fits(value, int) or value < 1):
                 raise ValueError(f"--{name} {value}: must be a positive integer")
         sense_noise.parse(self.noise or "none")
-        least = self.reach_threshold
-        if least is not None and not (_fits(least, float) and 0 <= least < 1):
-            raise ValueError(f"--reach-threshold {least}: must be at least 0 and below 1")
 
     @property
     def senses(self) -> SenseNoise:
@@ -377,13 +374,8 @@ class EvalConfig:
                     "place with --data"
                 )
         words = find_word_vectors(config, run, self.word_vectors)
-        network = config.network
-        if self.reach_threshold is not None:
-            if network.reach_threshold is None:
-                raise ValueError(f"--reach-threshold: {run} was trained without it")
-            network = dataclasses.replace(network, reach_threshold=self.reach_threshold)
-        rooms = config.in_rooms_alone()
-        return dataclasses.replace(rooms, data=data, word_vectors=words, network=network)
+        config = with_reach_threshold(config.in_rooms_alone(), self.reach_threshold, run)
+        return dataclasses.replace(config, data=data, word_vectors=words)
 
 
 def describe_departures(departures: Mapping[str, Any]) -> str:
@@ -412,6 +404,24 @@ def describe_departures(departures: Mapping[str, Any]) -> str:
 
 #: An evaluation of a run's own task.
 OWN_TASK = EvalConfig()
+
+
+def with_reach_threshold(
+    config: TrainConfig, threshold: float | None, run: Path | str
+) -> TrainConfig:
+    """A run's configuration with another threshold of reach, unless that is None.
+
+    Raises:
+      ValueError: the run has no estimate of reach, or the threshold is out of range.
+    """
+    if threshold is None:
+        return config
+    if not (_fits(threshold, float) and 0 <= threshold < 1):
+        raise ValueError(f"--reach-threshold {threshold}: must be at least 0 and below 1")
+    if config.network.reach_threshold is None:
+        raise ValueError(f"--reach-threshold: {run} was trained without it")
+    network = dataclasses.replace(config.network, reach_threshold=threshold)
+    return dataclasses.replace(config, network=network)
 
 
 def find_word_vectors(

@@ -20,7 +20,7 @@ from tdanet_jax import config as configs
 from tdanet_jax import words
 from tdanet_jax.agent.base import BaseAgent, Decision, sigmoid, softmax, without
 from tdanet_jax.agent.detection import Detection
-from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors
+from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors, with_reach_threshold
 from tdanet_jax.env.types import Observation
 from tdanet_jax.io.bundled_agents import find_run, folder_of
 from tdanet_jax.labels import Synonyms
@@ -341,6 +341,7 @@ def load(
     grid: PoseGrid = ITHOR,
     word_vectors: Path | str | None = None,
     synonyms: Synonyms | Path | str | None = None,
+    reach_threshold: float | None = None,
 ) -> Agent:
     """The agent of a run's newest checkpoint, or of a point of its history. Needs no rooms.
 
@@ -351,13 +352,17 @@ def load(
         have been trained on another.
       word_vectors: file of word vectors in place of the run's copy, for example with more words;
         they must be as wide.
+      synonyms: other names of things, {"Mug": ["beaker"]}, or a JSON file of them.
+      reach_threshold: the probability of reach from which `Done` is allowed, in place of the run's;
+        0 allows it everywhere.
 
     Raises:
-      ValueError: the folder holds no run, its checkpoint cannot be read, or its word vectors are
-        missing or of another width.
+      ValueError: the folder holds no run, its checkpoint cannot be read, its word vectors are
+        missing or of another width, or there is a threshold of reach but no estimate in the run.
     """
     run = find_run(run)
     config, weights, classes = read(run)
+    config = with_reach_threshold(config, reach_threshold, run)
     path = find_word_vectors(config, folder_of(run), word_vectors)
     vectors = words.load_word_vectors(path, classes.names)
     agent = Agent(config, weights, vectors, classes, grid, synonyms)

@@ -235,7 +235,10 @@ class NumPyAgent(BaseAgent):
 
 
 def load(
-    folder: Path | str, grid: PoseGrid = ITHOR, synonyms: Synonyms | Path | str | None = None
+    folder: Path | str,
+    grid: PoseGrid = ITHOR,
+    synonyms: Synonyms | Path | str | None = None,
+    reach_threshold: float | None = None,
 ) -> NumPyAgent:
     """An exported agent.
 
@@ -243,12 +246,21 @@ def load(
       folder: that `tdanet export` wrote.
       grid: the turns and steps of the world in which the agent acts, if it has sensors.
       synonyms: other names of things, {"Mug": ["beaker"]}, or a JSON file of them.
+      reach_threshold: the probability of reach from which `Done` is allowed, in place of the run's;
+        0 allows it everywhere.
 
     Raises:
-      ValueError: a file is missing, damaged or does not fit the others; the message names it.
+      ValueError: a file is missing, damaged or does not fit the others, and the message names it;
+        or there is a threshold of reach but no estimate.
     """
     folder = Path(folder)
     meta = _read_meta(folder / META_FILE)
+    if reach_threshold is not None:
+        if not 0 <= reach_threshold < 1:
+            raise ValueError(f"reach_threshold {reach_threshold}: must be at least 0 and below 1")
+        if not meta.reach_units:
+            raise ValueError(f"reach_threshold: {folder} estimates no reach")
+        meta = dataclasses.replace(meta, reach_threshold=reach_threshold)
     vectors = words.load_word_vectors(folder / WORDS_FILE)
     weights = npz.read(folder / MODEL_FILE)
     expected = shapes(meta, vectors.vectors.shape[1])

@@ -52,6 +52,9 @@ class Command:
     """File of further words, in GloVe's text format: a word and its numbers on each line."""
     synonyms: Path | None = None
     """JSON file of other names: {"Mug": ["beaker"]}."""
+    reach_threshold: float | None = None
+    """Probability of reach from which Done is allowed, instead of the run's. 0 allows Done
+    everywhere."""
 
     @property
     def camera(self) -> Camera:
@@ -75,7 +78,10 @@ def main(arguments: list[str] | None = None) -> None:
         devices.start()
         devices.keep_compiled()
         agent = load(
-            command.checkpoint, word_vectors=command.word_vectors, synonyms=command.synonyms
+            command.checkpoint,
+            word_vectors=command.word_vectors,
+            synonyms=command.synonyms,
+            reach_threshold=command.reach_threshold,
         )
         if command.words is not None:
             agent.add_words(command.words)

@@ -636,6 +636,23 @@ def test_a_checkpoint_of_a_newer_version_is_refused_in_one_line(tmp_path):
         tdanet_jax.load(run)
 
 
+def test_the_threshold_of_reach_can_be_another_one(some_rooms, glove, opinionated_run, tmp_path):
+    network = dataclasses.replace(
+        TINY.network, odometry=True, triangulation=True, reach_threshold=0.5
+    )
+    run = tmp_path / "run"
+    save_untrained(dataclasses.replace(TINY, network=network), run, some_rooms, glove)
+    seen, told = [Detection("mug", 0.4, 0.4, 0.6, 0.6)], []
+    for threshold in (None, 0.0, 0.999):
+        agent = tdanet_jax.load(run, reach_threshold=threshold)
+        decision = agent.act(agent.start(), seen, "mug")[1]
+        told.append(decision.probabilities[Action.DONE] > 0)
+    assert told == [decision.reach >= 0.5, True, False]
+    assert agent.act(agent.start(), seen, "sink")[1].reach is None
+    with pytest.raises(ValueError, match="--reach-threshold: .* was trained without it"):
+        tdanet_jax.load(opinionated_run, reach_threshold=0.5)
+
+
 def test_a_point_of_the_history_is_loaded_by_its_file(weights, glove, tmp_path):
     (tmp_path / "config.json").write_text(json.dumps(configs.to_json(CONFIG)))
     path = history.write(tmp_path, Snapshot(weights, 40, 3, 1.0, 1, "any"))

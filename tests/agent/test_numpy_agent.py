@@ -115,6 +115,22 @@ def test_if_all_else_is_forbidden_it_is_done_out_of_reach(glove, tmp_path, sampl
         np.testing.assert_array_equal(decision.probabilities, [0, 0, 0, 0, 0, 1])
 
 
+def test_the_threshold_of_reach_can_be_another_one(glove, folder, tmp_path):
+    theirs = small_agent(glove, **NETWORKS["robust"])
+    own = exported(theirs, tmp_path / "out")
+    seen = [Detection("mug", 0.4, 0.4, 0.6, 0.6)]
+    allowed = []
+    for threshold in (None, 0.0, 0.999):
+        agent = numpy_agent.load(own, reach_threshold=threshold)
+        allowed.append(agent.act(agent.start(), seen, "mug")[1].probabilities[Action.DONE] > 0)
+    reach = agent.act(agent.start(), seen, "mug")[1].reach
+    assert allowed == [reach >= 0.5, True, False]
+    with pytest.raises(ValueError, match=r"reach_threshold 1\.0: must be at least 0 and below 1"):
+        numpy_agent.load(own, reach_threshold=1.0)
+    with pytest.raises(ValueError, match="estimates no reach"):
+        numpy_agent.load(folder, reach_threshold=0.5)
+
+
 def test_a_folder_of_an_older_version_has_no_estimate_of_reach(folder, tmp_path):
     older = shutil.copytree(folder, tmp_path / "older")
     meta = json.loads((older / "meta.json").read_text())

@@ -377,6 +377,7 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--word-vectors": "--word-vectors words.txt",
             "--words": "--words words.txt",
             "--synonyms": "--synonyms mine.json",
+            "--reach-threshold": "--reach-threshold 0.5",
         },
     ),
     "replay": (SHOW, {**ONE_EPISODE, "--shortest": "--shortest"}),
