@@ -21,7 +21,8 @@ if TYPE_CHECKING:
         NavigatorConfig,
         load,
     )
-    from tdanet_jax.config import EvalConfig, LearnerConfig, NetworkConfig, TrainConfig
+    from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+    from tdanet_jax.eval_config import EvalConfig
     from tdanet_jax.task import make
     from tdanet_jax.training.callbacks import Callbacks
     from tdanet_jax.workflows.evaluate import evaluate
@@ -37,7 +38,7 @@ _PUBLIC = {
     "Camera": "agent",
     "Decision": "agent",
     "Detection": "agent",
-    "EvalConfig": "config",
+    "EvalConfig": "eval_config",
     "LearnerConfig": "config",
     "Navigator": "agent",
     "NavigatorConfig": "agent",

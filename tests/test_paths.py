@@ -17,7 +17,8 @@ from tdanet_jax import config as configs
 from tdanet_jax import words
 from tdanet_jax.agent import agent
 from tdanet_jax.analysis import episode_lookup
-from tdanet_jax.config import OWN_TASK, TrainConfig
+from tdanet_jax.config import TrainConfig
+from tdanet_jax.eval_config import OWN_TASK
 from tdanet_jax.evaluation import report, saved_networks
 from tdanet_jax.models import classes
 from tdanet_jax.scenes import SceneTables, collect, dataset, metadata, room_names

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tdanet_jax import sense_noise
-from tdanet_jax.config import EvalConfig, LearnerConfig, TrainConfig, describe_departures
+from tdanet_jax.config import LearnerConfig, TrainConfig
+from tdanet_jax.eval_config import EvalConfig, describe_departures
 from tdanet_jax.sense_noise import PRESETS, SWEEPS, SenseNoise, parse
 
 

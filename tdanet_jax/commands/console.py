@@ -293,7 +293,7 @@ def load_rooms(data: str | None) -> Rooms:
 
 def print_summary(results: Mapping[str, Any]) -> None:
     """One line per group: seen targets, 1000 episodes: SR 75.1 (70.2 to 80.0), SPL ..."""
-    from tdanet_jax.config import describe_departures
+    from tdanet_jax.eval_config import describe_departures
     from tdanet_jax.evaluation.metrics import MEASURES, shown
 
     if results.get("departures"):

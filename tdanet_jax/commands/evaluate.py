@@ -30,7 +30,8 @@ from tdanet_jax.commands.console import (
     print_summary,
     reporter,
 )
-from tdanet_jax.config import OWN_TASK, EvalConfig, TrainConfig
+from tdanet_jax.config import TrainConfig
+from tdanet_jax.eval_config import OWN_TASK, EvalConfig
 from tdanet_jax.io import files
 from tdanet_jax.sense_noise import SWEEP, SWEEP_FILE
 

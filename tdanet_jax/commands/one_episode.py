@@ -12,7 +12,8 @@ import tyro
 
 from tdanet_jax import config as configs
 from tdanet_jax.commands.console import RunPath, console, fail, load_rooms
-from tdanet_jax.config import CONFIG_FILE, EvalConfig
+from tdanet_jax.config import CONFIG_FILE
+from tdanet_jax.eval_config import EvalConfig
 from tdanet_jax.io.bundled_agents import folder_of
 from tdanet_jax.poses import TURNS
 

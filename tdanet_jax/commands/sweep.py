@@ -38,7 +38,8 @@ from tdanet_jax.commands.console import (
 from tdanet_jax.commands.running import Command as TrainingCommand
 from tdanet_jax.commands.running import how_to_continue, parse_command, stoppable
 from tdanet_jax.commands.streams import output_may_break
-from tdanet_jax.config import CONFIG_FILE, OWN_TASK, TrainConfig, run_name
+from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
+from tdanet_jax.eval_config import OWN_TASK
 from tdanet_jax.io import files
 from tdanet_jax.splits import file_name
 from tdanet_jax.training import cluster

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tdanet_jax.config import TrainConfig, describe_departures
+from tdanet_jax.config import TrainConfig
+from tdanet_jax.eval_config import describe_departures
 from tdanet_jax.evaluation import metrics, paper
 from tdanet_jax.evaluation.metrics import BUCKETS
 from tdanet_jax.io.escaping import in_markdown

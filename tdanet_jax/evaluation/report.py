@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 import tdanet_jax
-from tdanet_jax.config import TrainConfig, describe_departures
+from tdanet_jax.config import TrainConfig
+from tdanet_jax.eval_config import describe_departures
 from tdanet_jax.evaluation import paper
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.metrics import (

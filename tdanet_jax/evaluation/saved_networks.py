@@ -17,7 +17,8 @@ import jax.numpy as jnp
 
 from tdanet_jax import config as configs
 from tdanet_jax import words
-from tdanet_jax.config import CONFIG_FILE, OWN_TASK, WORD_VECTORS_FILE, EvalConfig, TrainConfig
+from tdanet_jax.config import CONFIG_FILE, WORD_VECTORS_FILE, TrainConfig
+from tdanet_jax.eval_config import OWN_TASK, EvalConfig
 from tdanet_jax.evaluation import comparison, policies, report, rollout, selection
 from tdanet_jax.evaluation.report import Played
 from tdanet_jax.io import assets, files

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from tdanet_jax import sense_noise
-from tdanet_jax.config import EvalConfig
 from tdanet_jax.env.params import with_noise
 from tdanet_jax.env.types import EnvParams
+from tdanet_jax.eval_config import EvalConfig
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.scenes.tables import SceneTables

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from tdanet_jax.analysis import figures
-from tdanet_jax.config import OWN_TASK, EvalConfig, TrainConfig
+from tdanet_jax.config import TrainConfig
+from tdanet_jax.eval_config import OWN_TASK, EvalConfig
 from tdanet_jax.evaluation import comparison, policies, report, rollout, saved_networks, selection
 from tdanet_jax.evaluation.policies import MakePolicy, Policy
 from tdanet_jax.evaluation.saved_networks import SavedNetwork

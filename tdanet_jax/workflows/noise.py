@@ -15,7 +15,7 @@ from typing import Any
 
 from tdanet_jax import sense_noise
 from tdanet_jax.analysis import figures
-from tdanet_jax.config import OWN_TASK, EvalConfig, describe_departures
+from tdanet_jax.eval_config import OWN_TASK, EvalConfig, describe_departures
 from tdanet_jax.evaluation import metrics, report, results_file, saved_networks
 from tdanet_jax.evaluation.metrics import MEASURES
 from tdanet_jax.evaluation.saved_networks import SavedNetwork

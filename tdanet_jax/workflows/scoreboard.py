@@ -22,7 +22,8 @@ import numpy as np
 
 from tdanet_jax import config as configs
 from tdanet_jax.analysis import episode_lookup
-from tdanet_jax.config import BUDGETS, CONFIG_FILE, PRESETS, TrainConfig, describe_departures
+from tdanet_jax.config import BUDGETS, CONFIG_FILE, PRESETS, TrainConfig
+from tdanet_jax.eval_config import describe_departures
 from tdanet_jax.evaluation import comparison, episodes, metrics, report, results_file, rollout
 from tdanet_jax.evaluation.comparison import Result
 from tdanet_jax.evaluation.policies import Policy

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Literal
 
 from tdanet_jax import config as configs
-from tdanet_jax.config import CONFIG_FILE, OWN_TASK, TrainConfig
+from tdanet_jax.config import CONFIG_FILE, TrainConfig
+from tdanet_jax.eval_config import OWN_TASK
 from tdanet_jax.evaluation import comparison, results_file
 from tdanet_jax.evaluation.comparison import Result
 from tdanet_jax.io import files

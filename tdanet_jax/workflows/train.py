@@ -14,7 +14,8 @@ import jax
 from tdanet_jax import config as configs
 from tdanet_jax.analysis import figures
 from tdanet_jax.analysis.episode_lookup import name_ranges
-from tdanet_jax.config import CONFIG_FILE, OWN_TASK, WORD_VECTORS_FILE, TrainConfig
+from tdanet_jax.config import CONFIG_FILE, WORD_VECTORS_FILE, TrainConfig
+from tdanet_jax.eval_config import OWN_TASK
 from tdanet_jax.evaluation import episodes, policies, report, rollout
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.io import files

@@ -649,7 +649,7 @@ def test_the_threshold_of_reach_can_be_another_one(some_rooms, glove, opinionate
         told.append(decision.probabilities[Action.DONE] > 0)
     assert told == [decision.reach >= 0.5, True, False]
     assert agent.act(agent.start(), seen, "sink")[1].reach is None
-    with pytest.raises(ValueError, match="--reach-threshold: .* was trained without it"):
+    with pytest.raises(ValueError, match=r"--reach-threshold: .* was trained without it"):
         tdanet_jax.load(opinionated_run, reach_threshold=0.5)
 
 

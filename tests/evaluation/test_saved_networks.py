@@ -19,7 +19,8 @@ from tdanet_jax.agent.detection import Detection
 from tdanet_jax.analysis import trace
 from tdanet_jax.commands import share
 from tdanet_jax.commands.train_zero_shot import main as train
-from tdanet_jax.config import WORD_VECTORS_FILE, EvalConfig
+from tdanet_jax.config import WORD_VECTORS_FILE
+from tdanet_jax.eval_config import EvalConfig
 from tdanet_jax.evaluation import report, saved_networks
 from tdanet_jax.io import bundled_agents
 from tdanet_jax.scenes import SceneTables, dataset

@@ -15,8 +15,8 @@ import pytest
 import tdanet_jax
 from tdanet_jax import EvalConfig
 from tdanet_jax.commands import evaluate
-from tdanet_jax.config import OWN_TASK, describe_departures
 from tdanet_jax.env.params import TEST_STEP_LIMITS
+from tdanet_jax.eval_config import OWN_TASK, describe_departures
 from tdanet_jax.evaluation import comparison, episodes, selection
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.scenes import SceneTables

@@ -10,7 +10,7 @@ import pytest
 
 import tdanet_jax
 from tdanet_jax.commands import evaluate
-from tdanet_jax.config import EvalConfig
+from tdanet_jax.eval_config import EvalConfig
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.sense_noise import NONE, SenseNoise
 from tdanet_jax.words import WordVectors

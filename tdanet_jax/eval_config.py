@@ -1,0 +1,114 @@
+"""How an evaluation departs from a run's own task. Imports no JAX."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tdanet_jax import sense_noise
+from tdanet_jax.config import TrainConfig, find_word_vectors, fits, with_reach_threshold
+from tdanet_jax.sense_noise import SenseNoise
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalConfig:
+    """Where an evaluation departs from the run's own task."""
+
+    data: str | None = None
+    """File of rooms that `tdanet scenes import` wrote, instead of the run's or the bundled
+    ones; also the new place of a file that was moved."""
+    word_vectors: str | None = None
+    """File of word vectors, instead of the run's or the bundled ones. A run keeps a copy of the
+    vectors it was trained with, and needs the file only if that lacks the rooms' classes."""
+    step_limit: int | None = None
+    """Actions after which an episode ends, instead of the test's limits for each room type."""
+    episodes: int | None = None
+    """Play at most this many episodes of each list, evenly spaced, for a quick look."""
+    scenes: tuple[str, ...] = ()
+    """Play only the test episodes in these rooms, such as FloorPlan228."""
+    targets: tuple[str, ...] = ()
+    """Play only the test episodes with these targets, such as Laptop."""
+    noise: str | None = None
+    """Senses that err: detector, wheels, mix, or levels such as misses=0.2,jitter=0.1
+    (docs/noise.md). The command also takes sweep: five levels of each kind of noise."""
+    reach_threshold: float | None = None
+    """Probability of reach from which Done is allowed, instead of the run's; only for runs that
+    were trained with one. 0 allows Done everywhere."""
+
+    def check(self) -> None:
+        """Raises ValueError, with one line that names the flag, if a value is out of range."""
+        for name, value in (("step-limit", self.step_limit), ("episodes", self.episodes)):
+            if value is not None and (not fits(value, int) or value < 1):
+                raise ValueError(f"--{name} {value}: must be a positive integer")
+        sense_noise.parse(self.noise or "none")
+
+    @property
+    def senses(self) -> SenseNoise:
+        """The noise of the senses. Raises ValueError if it is not given as it must be."""
+        return sense_noise.parse(self.noise or "none")
+
+    @property
+    def departures(self) -> dict[str, Any]:
+        """The values, by name, for which this is not the official test; none if it is."""
+        values = {name: getattr(self, name) for name in ("step_limit", "episodes")}
+        values |= {name: list(getattr(self, name)) for name in ("scenes", "targets")}
+        if self.senses.any:
+            values["noise"] = str(self.senses)
+        departures = {name: value for name, value in values.items() if value}
+        if self.reach_threshold is not None:
+            departures["reach_threshold"] = self.reach_threshold
+        return departures
+
+    def locate(self, config: TrainConfig, run: Path | str) -> TrainConfig:
+        """A run's configuration as it is evaluated, with its files and no rooms to train in alone.
+
+        Args:
+          config: the run's.
+          run: its folder.
+
+        Raises:
+          ValueError: a file that the run was trained with is not where it was, and the message says
+            how to give its new place; or there is a threshold of reach, but no estimate in the run.
+        """
+        run = Path(run)
+        data = self.data
+        if data is None and config.data is not None:
+            data = config.data
+            if not Path(data).is_file():
+                raise ValueError(
+                    f"{data}: no such file; {run} was trained in these rooms: give the file's "
+                    "place with --data"
+                )
+        words = find_word_vectors(config, run, self.word_vectors)
+        config = with_reach_threshold(config.in_rooms_alone(), self.reach_threshold, run)
+        return dataclasses.replace(config, data=data, word_vectors=words)
+
+
+def describe_departures(departures: Mapping[str, Any]) -> str:
+    """`EvalConfig.departures` in words, for reports."""
+    texts = {
+        "step_limit": "at most {} actions per episode",
+        "episodes": "at most {} episodes of each list, evenly spaced",
+        "scenes": "only in {}",
+        "targets": "only for {}",
+        "noise": "senses that err, {}",
+        "reach_threshold": "Done with a probability of reach of {} or more",
+    }
+    parts = [
+        text.format(
+            ", ".join(value)
+            if isinstance(value, list)
+            else f"{value:,}"
+            if isinstance(value, int)
+            else value
+        )
+        for name, text in texts.items()
+        if (value := departures.get(name)) is not None
+    ]
+    return f"Not the official test: {'; '.join(parts)}"
+
+
+#: An evaluation of a run's own task.
+OWN_TASK = EvalConfig()
