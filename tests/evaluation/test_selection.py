@@ -150,6 +150,7 @@ def test_the_results_say_that_it_is_not_the_test(
     assert max(record["e"] for record in records) == 3
 
 
+@pytest.mark.slow
 def test_a_run_is_evaluated_with_another_threshold_of_reach(
     ithor: SceneTables, glove: WordVectors, tmp_path: Path
 ) -> None:
