@@ -430,7 +430,7 @@ def ppo(
     return jax.value_and_grad(total, has_aux=True)(params)
 
 
-@pytest.mark.parametrize(("parts", "epochs"), [(3, 2), (1, 2)])
+@pytest.mark.parametrize(("parts", "epochs"), [(3, 2), pytest.param(1, 2, marks=pytest.mark.slow)])
 def test_several_optimiser_steps_are_ppo_on_minibatches(parts: int, epochs: int) -> None:
     config = dataclasses.replace(
         CONFIG, num_minibatches=parts, update_epochs=epochs, clip_coef=0.05, learning_rate=0.01

@@ -257,7 +257,7 @@ class Watching(Callbacks):
         self.stopped = True
 
 
-@pytest.mark.parametrize("stop", [False, True])
+@pytest.mark.parametrize("stop", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_run_that_waits_for_rooms_says_so_and_can_be_stopped(
     task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow: threading.Event, stop: bool
 ) -> None:
