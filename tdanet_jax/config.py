@@ -202,7 +202,7 @@ class TrainConfig:
     """Most variants and generated rooms of a pool. If there are more, pools take turns: the first,
     the present and the next one are in memory, and the next is built or loaded meanwhile. They are
     made of files of 100 generated rooms, or of a variant of each room."""
-    pool_updates: int = 200
+    pool_updates: int = 800
     """Updates in a pool before the next one's turn, rounded to whole calls of --chunk-updates."""
     chunk_updates: int = 10
     """Updates per compiled call; progress is reported after each call."""

@@ -10,6 +10,8 @@ from typing import Any
 from tdanet_jax import sense_noise
 from tdanet_jax.config import TrainConfig, find_word_vectors, fits, with_reach_threshold
 from tdanet_jax.sense_noise import SenseNoise
+from tdanet_jax.splits import OPEN
+from tdanet_jax.targets import canonical, known_classes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,6 +24,9 @@ class EvalConfig:
     word_vectors: str | None = None
     """File of word vectors, instead of the run's or the bundled ones. A run keeps a copy of the
     vectors it was trained with, and needs the file only if that lacks the rooms' classes."""
+    test_targets: str | None = None
+    """Test on these targets instead of the run's, given as the training command takes them: paper,
+    all or names. Test episodes are those of a run with these targets."""
     step_limit: int | None = None
     """Actions after which an episode ends, instead of the test's limits for each room type."""
     episodes: int | None = None
@@ -42,6 +47,12 @@ class EvalConfig:
         for name, value in (("step-limit", self.step_limit), ("episodes", self.episodes)):
             if value is not None and (not fits(value, int) or value < 1):
                 raise ValueError(f"--{name} {value}: must be a positive integer")
+        if self.test_targets is not None:
+            try:
+                known_classes(self.test_targets, self.data)
+            except ValueError as error:
+                line = str(error).replace("--targets", "--test-targets", 1)
+                raise ValueError(line) from None
         sense_noise.parse(self.noise or "none")
 
     @property
@@ -70,9 +81,16 @@ class EvalConfig:
 
         Raises:
           ValueError: a file that the run was trained with is not where it was, and the message says
-            how to give its new place; or there is a threshold of reach, but no estimate in the run.
+            how to give its new place; there is a threshold of reach, but no estimate in the run;
+            or there are other targets for a split that has its own.
         """
         run = Path(run)
+        if self.test_targets is not None:
+            if config.split == OPEN:
+                raise ValueError(
+                    f"--test-targets {self.test_targets}: {run} has the targets of --split {OPEN}"
+                )
+            config = dataclasses.replace(config, targets=canonical(self.test_targets))
         data = self.data
         if data is None and config.data is not None:
             data = config.data

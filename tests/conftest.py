@@ -157,5 +157,5 @@ def save_untrained(
         weights["actor"]["bias"] = weights["actor"]["bias"].at[Action.DONE].set(-1.0)
     rest = {f.name: jnp.int32(counts.get(f.name, 0)) for f in dataclasses.fields(TrainState)}
     state = TrainState(**rest | {"params": weights, "key": jax.random.key(0)})
-    Checkpoints(folder).save(state, {"seconds": 0.0, "data_version": tables.data_version})
+    Checkpoints(folder).save(state, {"seconds": 0.0, "data_version": task.tables.data_version})
     return task, weights

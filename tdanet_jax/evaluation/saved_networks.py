@@ -26,7 +26,8 @@ from tdanet_jax.io.bundled_agents import find_run
 from tdanet_jax.io.untrusted import regular
 from tdanet_jax.models import classes
 from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
-from tdanet_jax.task import Task, load_task
+from tdanet_jax.scenes.dataset import Rooms, find_targets, load_rooms
+from tdanet_jax.task import Task, task_in
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import Checkpoints, is_shared, newest
 from tdanet_jax.training.history import Snapshot
@@ -167,18 +168,20 @@ def evaluate(
         noiseless = dataclasses.replace(network.test, noise=None)
         groups.setdefault((_task_config(network), noiseless), []).append(network)
     for members in groups.values():
-        task = load_task(members[0].located)
+        located = members[0].located
+        rooms = load_rooms(located.data)
+        task = task_in(rooms, located)
         params, lists = selection.select(task, members[0].test)
         policy = policies.network(task.model, task.words, greedy)
         expected = task.model.parameter_shapes(*task.words.shape)
-        width = None if members[0].located.word_vectors is None else task.words.shape[1]
+        width = None if located.word_vectors is None else task.words.shape[1]
         senses = [network.test.senses for network in members]
         worlds = selection.with_senses(task, params, senses)
         alone = jax.default_backend() == "cpu" or len({*senses}) > 1
         together = 1 if alone else TOGETHER
         for start in range(0, len(members), together):
             part, params = members[start : start + together], worlds[start]
-            snapshots = [_checked(network, task) for network in part]
+            snapshots = [_checked(network, task, rooms) for network in part]
             for network, snapshot in zip(part, snapshots, strict=True):
                 of = network.point or network.run
                 history.check_fit(of, snapshot.weights, expected, width)
@@ -196,7 +199,9 @@ def evaluate(
                     task=task,
                     provenance=report.Provenance.of(
                         task,
-                        dataclasses.replace(network.config, data=network.located.data),
+                        dataclasses.replace(
+                            network.config, data=located.data, targets=located.targets
+                        ),
                         "greedy" if greedy else "sample",
                         drawn,
                         snapshot.episodes,
@@ -220,12 +225,14 @@ def _task_config(network: SavedNetwork) -> TrainConfig:
     return TrainConfig(**values)
 
 
-def _checked(network: SavedNetwork, task: Task) -> Snapshot:
-    snapshot = network.load()
-    if network.test.data is None and snapshot.data_version != task.tables.data_version:
+def _checked(network: SavedNetwork, task: Task, rooms: Rooms) -> Snapshot:
+    snapshot, tables = network.load(), task.tables
+    if network.test.test_targets is not None:  # tables with other targets have another version
+        tables = find_targets(network.config.sought, rooms, network.config.validation)[0]
+    if network.test.data is None and snapshot.data_version != tables.data_version:
         raise ValueError(
             f"{network.point or network.run}: trained on scene tables {snapshot.data_version}, "
-            f"these are {task.tables.data_version}"
+            f"these are {tables.data_version}"
         )
     task.check_known(network.run, classes.load_vocabulary(network.run).names)
     return snapshot

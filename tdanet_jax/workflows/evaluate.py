@@ -116,8 +116,8 @@ def _evaluate_policy(
             known = ", ".join(UNTRAINED)
             raise ValueError(f"policy {policy}: needs a checkpoint, or choose one of {known}")
         policy = UNTRAINED[policy]()
-    files = {"data": test.data, "word_vectors": test.word_vectors}
-    chosen: dict[str, Any] = {name: path for name, path in files.items() if path is not None}
+    given = {"data": test.data, "word_vectors": test.word_vectors, "targets": test.test_targets}
+    chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     config = dataclasses.replace(config, **chosen)
     task, seed = load_task(config), config.seed if seed is None else seed
     params, lists = selection.select(task, test)

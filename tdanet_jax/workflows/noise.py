@@ -109,11 +109,13 @@ class _Level:
     def same(self, snapshot: Snapshot, policy: str, seed: int | None) -> Row:
         """What is known of its row before it is played, and equal for all rows of the agent."""
         test = self.network.test
+        own = test.data is None and test.test_targets is None
         return {
             "policy": policy,
             "updates": snapshot.updates,
             "evaluation_seed": self.network.config.seed if seed is None else seed,
-            **({"data_version": snapshot.data_version} if test.data is None else {}),
+            **({"data_version": snapshot.data_version} if own else {}),
+            "test_targets": test.test_targets,
             "departures": dataclasses.replace(test, noise=None).departures or None,
         }
 

@@ -306,6 +306,7 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--targets": "--targets Mug",
             "--noise": "--noise mix",
             "--reach-threshold": "--reach-threshold 0.5",
+            "--test-targets": "--test-targets Mug",
             "--seed": "--seed 5",
             "--out": "--out new",
         },

@@ -15,11 +15,12 @@ import pytest
 
 import tdanet_jax
 from tdanet_jax import Agent, Callbacks, words
+from tdanet_jax import config as configs
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.analysis import trace
 from tdanet_jax.commands import share
 from tdanet_jax.commands.train_zero_shot import main as train
-from tdanet_jax.config import WORD_VECTORS_FILE
+from tdanet_jax.config import CONFIG_FILE, WORD_VECTORS_FILE, TrainConfig
 from tdanet_jax.eval_config import EvalConfig
 from tdanet_jax.evaluation import report, saved_networks
 from tdanet_jax.io import bundled_agents
@@ -92,6 +93,61 @@ def test_a_shared_agent_is_not_resumed(
         train(["--resume", str(BUNDLED)])
     assert "there is nothing to continue from" in capsys.readouterr().err
     assert newest(BUNDLED).updates
+
+
+def test_a_run_is_tested_on_the_targets_of_another(
+    some_rooms: SceneTables,
+    glove: WordVectors,
+    rooms_file: Path,
+    few_episodes: None,
+    tmp_path: Path,
+) -> None:
+    """The same network, in runs with other targets, plays the same episodes of the same targets."""
+    found = {}
+    for name, targets in {"paper": "paper", "others": "Mug,Kettle"}.items():
+        config = dataclasses.replace(TINY, data=str(rooms_file), targets=targets)
+        save_untrained(config, tmp_path / name, some_rooms, glove)
+        for test in (None, "paper", "mug, kettle"):
+            done = tdanet_jax.evaluate(tmp_path / name, test=EvalConfig(test_targets=test))
+            found[name, test] = {
+                key: done[key] for key in (*GROUPS, "by_target", "targets", "data_version")
+            }
+            assert done["departures"] is None
+    assert found["paper", None] == found["paper", "paper"] == found["others", "paper"]
+    assert found["others", None] == found["others", "mug, kettle"] == found["paper", "mug, kettle"]
+    assert {*found["paper", "mug, kettle"]["by_target"]} == {"Kettle", "Mug"}
+    assert found["paper", "mug, kettle"]["targets"] == "Mug,Kettle"
+
+
+def test_other_targets_hide_no_other_rooms(
+    some_rooms: SceneTables, glove: WordVectors, rooms_file: Path, tmp_path: Path
+) -> None:
+    """The rooms still have to be those of the run."""
+    fewer = some_rooms.subset([name for name in some_rooms.scenes if name != "FloorPlan7"])
+    save_untrained(TINY, tmp_path / "run", fewer, glove)
+    with pytest.raises(ValueError, match=r"run: trained on scene tables \w+, these are \w+"):
+        tdanet_jax.evaluate(tmp_path / "run", test=EvalConfig(test_targets="Mug"))
+
+
+@pytest.mark.parametrize(
+    ("config", "targets", "error"),
+    [
+        (TINY, "ketle", "--test-targets ketle: no class of these rooms; did you mean Kettle"),
+        (TINY, "Mug,,", "--test-targets Mug,,: a name is missing"),
+        (
+            dataclasses.replace(TINY, split="open"),
+            "Mug",
+            "--test-targets Mug: .*run has the targets of --split open",
+        ),
+    ],
+)
+def test_test_targets_that_cannot_be_are_refused(
+    opinionated_run: Path, tmp_path: Path, config: TrainConfig, targets: str, error: str
+) -> None:
+    shutil.copytree(opinionated_run, tmp_path / "run")
+    configs.save(config, tmp_path / "run" / CONFIG_FILE)
+    with pytest.raises(ValueError, match=f"^{error}"):
+        tdanet_jax.evaluate(tmp_path / "run", test=EvalConfig(test_targets=targets))
 
 
 @pytest.fixture
