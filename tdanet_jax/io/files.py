@@ -126,8 +126,10 @@ def check_writable(out: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(folder: Path, wait: bool = False) -> Iterator[None]:
+def locked(folder: Path, wait: bool = False, name: str = LOCK_FILE) -> Iterator[None]:
     """Holds the lock of a folder, which is created if it does not exist.
+
+    With another `name`, it is a lock of that name alone: of one of the folder's files, say.
 
     The operating system releases the lock when the process ends, however it ends. On an error, a
     folder that was created for nothing is removed again.
@@ -140,9 +142,10 @@ def locked(folder: Path, wait: bool = False) -> Iterator[None]:
 
     created = [place for place in (folder, *folder.parents) if not place.exists()]
     folder.mkdir(parents=True, exist_ok=True)
-    if (folder / LOCK_FILE).is_symlink():
-        raise OSError(errno.ELOOP, "a link, which is not followed here", str(folder / LOCK_FILE))
-    lock = FileLock(folder / LOCK_FILE)
+    path = folder / name
+    if path.is_symlink():
+        raise OSError(errno.ELOOP, "a link, which is not followed here", str(path))
+    lock = FileLock(path)
     try:
         lock.acquire(blocking=wait)
     except Timeout:
@@ -150,8 +153,8 @@ def locked(folder: Path, wait: bool = False) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        if created and [path.name for path in folder.iterdir()] == [LOCK_FILE]:
-            (folder / LOCK_FILE).unlink()
+        if created and [*folder.iterdir()] == [path]:
+            path.unlink()
             with contextlib.suppress(OSError):  # another process has come to use them
                 for place in created:
                     place.rmdir()

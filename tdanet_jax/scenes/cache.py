@@ -3,8 +3,8 @@ and of generated rooms.
 
 The name of a cached file contains a hash of everything that determines it: the rooms and the
 source of the modules that compute the tables; or tables and further targets
-(`target_distances`). Files are written atomically, and if several
-processes need the tables at the same time, one computes them while the others wait.
+(`target_distances`). Files are written atomically, and if several processes need the same one at
+the same time, one computes it while the others wait.
 """
 
 from __future__ import annotations
@@ -120,30 +120,32 @@ def load(name: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, n
     if (found := _read(path)) is not None:
         return found
     with contextlib.ExitStack() as stack:
-        _lock(stack)
+        _lock(stack, f".{path.stem}.lock")
         if (found := _read(path)) is not None:
             return found
         if path.exists():
             warnings.warn(f"{path}: damaged, computed again", stacklevel=3)
         result = compute()
         try:
-            _store(result, path)
-            _remove_unused(path.parent)
+            with files.locked(path.parent, wait=True):  # of the folder: nobody else writes to it
+                files.remove_partial(path.parent)
+                _store(result, path)
+                _remove_unused(path.parent)
         except OSError as error:
             warnings.warn(f"{path}: not cached ({error.strerror})", stacklevel=3)
     return result
 
 
-def _lock(stack: contextlib.ExitStack) -> None:
-    """Locks the cache until `stack` unwinds, unless the cache cannot be written."""
+def _lock(stack: contextlib.ExitStack, name: str) -> None:
+    """Holds a lock until `stack` unwinds, unless the cache cannot be written."""
     try:
-        stack.enter_context(files.locked(folder()))
+        stack.enter_context(files.locked(folder(), name=name))
     except BlockingIOError:
         warnings.warn("another process computes the rooms' tables: waiting for it", stacklevel=3)
-        stack.enter_context(files.locked(folder(), wait=True))
+        stack.enter_context(files.locked(folder(), wait=True, name=name))
     except OSError:
         return
-    files.remove_partial(folder())
+    stack.callback((folder() / name).unlink, missing_ok=True)
 
 
 def _read(path: Path) -> dict[str, np.ndarray] | None:

@@ -128,6 +128,24 @@ def test_one_of_several_processes_builds_and_the_others_wait(tmp_path: Path) -> 
     assert len(files_of(tmp_path)) == 2
 
 
+def test_nobody_waits_for_what_he_does_not_need(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While one process builds the rooms, another one computes and stores something else."""
+    first = start_building(tmp_path)
+    read_until(first.stdout, "building")
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cache.load(f"{cache.DISTANCES}1.npz", lambda: {"distance": np.arange(3)})
+        again = cache.load(f"{cache.DISTANCES}1.npz", lambda: pytest.fail("computed again"))
+    assert again["distance"].tolist() == [0, 1, 2]
+    first.communicate("go\n")
+    assert first.returncode == 0
+    assert {path.suffix for path in files_of(tmp_path)} == {".npz", ".sha256"}
+    assert len(files_of(tmp_path)) == 4
+
+
 def test_a_killed_builder_leaves_no_lock_and_no_partial_file(tmp_path: Path) -> None:
     killed = start_building(tmp_path)
     assert killed.stdout is not None
