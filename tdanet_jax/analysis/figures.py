@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
@@ -96,26 +97,32 @@ def training_curves(
     drawing.save(figure, path, DPI, comment)
 
 
-def room_curve(
-    points: Sequence[tuple[str, int, Mapping[str, Mapping[str, float]]]],
+def data_curve(
+    points: Sequence[tuple[str, str, int, Mapping[str, Mapping[str, float]]]],
     path: Path,
     comment: str | None = None,
 ) -> None:
-    """SR and SPL of seen and unseen targets against the number of training rooms.
+    """SR and SPL of seen and unseen targets against what agents were trained on.
 
     Args:
-      points: of each run, the kind of its rooms, their number, and its results in percent by group
-        and measure. A kind's line goes through the means of runs in as many rooms.
+      points: of each run, what is counted, its kind, its number, and the results in percent by
+        group and measure. A kind's line goes through the means of runs with the same number.
       path: the picture's file.
       comment: unseen, in the file; it must be a PNG then.
     """
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    axes = figure.subplots(2, 2, sharex=True, sharey="row")
-    kinds = [*dict.fromkeys(kind for kind, _, _ in points)]
+    counted = [*dict.fromkeys(what for what, *_ in points)]
+    figure = Figure(figsize=(4 * len(counted) * len(GROUPS), 6), layout="constrained")
+    axes = figure.subplots(
+        len(MEASURES), len(counted) * len(GROUPS), sharex="col", sharey="row", squeeze=False
+    )
+    kinds = [*dict.fromkeys(kind for _, kind, _, _ in points)]
     for row, measure in zip(axes, MEASURES, strict=True):
-        for axis, group in zip(row, GROUPS, strict=True):
+        for axis, (what, group) in zip(row, itertools.product(counted, GROUPS), strict=True):
+            own = [(k, n, found[group][measure]) for w, k, n, found in points if w == what]
             for index, kind in enumerate(kinds):
-                runs = [(count, found[group][measure]) for k, count, found in points if k == kind]
+                runs = [(count, rate) for k, count, rate in own if k == kind]
+                if not runs:
+                    continue
                 counts = sorted({count for count, _ in runs})
                 means = [np.mean([rate for n, rate in runs if n == count]) for count in counts]
                 color = PALETTE[index % len(PALETTE)]
@@ -123,15 +130,18 @@ def room_curve(
                 marker = MARKERS[index % len(MARKERS)]
                 axis.plot(*zip(*runs, strict=True), marker, color=color, label=kind)
             axis.set(xscale="log", ylabel=f"{group} targets, {measure}, per cent")
+            ticks = sorted({count for _, count, _ in own})
+            axis.set_xticks(ticks, [f"{count:,}" for count in ticks], minor=False, rotation=45)
+            axis.set_xticks([], minor=True)
             axis.grid(alpha=0.3)
             axis.spines[["top", "right"]].set_visible(False)
-    ticks = sorted({count for _, count, _ in points})
-    for axis in axes[-1]:
-        axis.set(xlabel="training rooms")
-        axis.set_xticks(ticks, [f"{count:,}" for count in ticks], minor=False)
-        axis.set_xticks([], minor=True)
-    lines = axes[0][0].get_legend_handles_labels()
-    figure.legend(*lines, loc="outside lower center", ncols=2, frameon=False)
+            axis.set(xlabel=what if row is axes[-1] else "")
+    labels = {
+        label: line
+        for axis in axes[0]
+        for line, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(labels.values(), [*labels], loc="outside lower center", ncols=2, frameon=False)
     drawing.save(figure, path, DPI, comment)
 
 

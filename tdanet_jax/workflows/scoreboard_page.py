@@ -18,16 +18,18 @@ from pathlib import Path
 from typing import Any
 
 from tdanet_jax.analysis import figures
-from tdanet_jax.config import CONFIG_FILE
+from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.evaluation import comparison, metrics, paper
 from tdanet_jax.io import files
 from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.io.untrusted import FileError
+from tdanet_jax.scenes.dataset import find_targets, load_rooms
 from tdanet_jax.splits import GROUPS, NAMED, file_name, make_split
+from tdanet_jax.targets import PAPER
 from tdanet_jax.workflows.scoreboard import VALIDATION, Row
 
-#: What the names of the rows begin with that show what more rooms give.
-ROOMS = f"{VALIDATION}rooms-"
+#: What the names of the rows begin with that show what more rooms, and more targets, give.
+ROOMS, TARGETS = f"{VALIDATION}rooms-", f"{VALIDATION}targets-"
 MARK = "<!-- scoreboard: "
 _HEADS = ("Agent", "Senses beyond the paper's", "Seeds", "Steps", "Hours")
 _BLOCK = re.compile(rf"^{MARK}([^\n]+) -->\n(.*?)^<!-- end -->$", re.DOTALL | re.MULTILINE)
@@ -191,8 +193,8 @@ def picture(split: str) -> str:
 
 
 def write(root: Path | str, rows: Sequence[Row]) -> list[Path]:
-    """Writes the blocks of all pages, and draws the learning curves, and the curve of more rooms,
-    that have changed.
+    """Writes the blocks of all pages, and draws the learning curves and what more rooms and targets
+    give, where they have changed.
 
     Returns:
       What was not up to date; pictures without rows are deleted.
@@ -211,10 +213,10 @@ def write(root: Path | str, rows: Sequence[Row]) -> list[Path]:
         draw = functools.partial(figures.training_curves, curves, f"Split {split}, training rooms")
         changed += _drawn(root / "docs" / picture(split), curves, draw)
     points = [_room_point(row) for row in rows if row.name.startswith(ROOMS)]
-    changed += _drawn(
-        root / "docs" / "room_curve.png", points, functools.partial(figures.room_curve, points)
-    )
-    return changed
+    others = [_target_point(row) for row in rows if row.name.startswith((ROOMS, TARGETS))]
+    points += [point for point in others if point is not None]
+    path = root / "docs" / "data_curve.png"
+    return changed + _drawn(path, points, functools.partial(figures.data_curve, points))
 
 
 def _drawn(path: Path, content: Sequence[Any], draw: Callable[[Path, str], None]) -> list[Path]:
@@ -230,15 +232,13 @@ def _drawn(path: Path, content: Sequence[Any], draw: Callable[[Path, str], None]
     return [path]
 
 
-def _room_point(row: Row) -> tuple[str, int, dict[str, dict[str, float]]]:
-    """The kind and number of a run's training rooms, and its SR and SPL by group.
+#: What is counted, its kind and number, and SR and SPL by group.
+Point = tuple[str, str, int, dict[str, dict[str, float]]]
 
-    Raises:
-      ValueError: the run was not trained here.
-    """
-    config, results = row.config, row.results
-    if config is None:
-        raise ValueError(f"{row.name}: no {CONFIG_FILE}")
+
+def _room_point(row: Row) -> Point:
+    """The kind and number of a run's training rooms. Raises ValueError: it was not trained here."""
+    config = _config(row)
     own = len(make_split(config.split, config.validation).train_scenes)
     kinds = {
         "real": 0 if config.generated_only else own,
@@ -246,6 +246,32 @@ def _room_point(row: Row) -> tuple[str, int, dict[str, dict[str, float]]]:
         "generated": config.generated,
     }
     kind = " and ".join(name for name, count in kinds.items() if count)
-    bucket = {group: results[group]["L>=1"] for group in GROUPS}
-    found = {group: {m: bucket[group][m] for m in comparison.MEASURES} for group in GROUPS}
-    return kind, sum(kinds.values()), found
+    return "training rooms", f"{kind} rooms", sum(kinds.values()), _rates(row)
+
+
+def _target_point(row: Row) -> Point | None:
+    """The number of a run's training targets, each of a room type; None in other than real rooms.
+
+    Raises:
+      ValueError: it was not trained here.
+    """
+    config = _config(row)
+    if config.variants or config.generated:
+        return None
+    targets = None
+    if config.targets != PAPER:
+        targets = find_targets(config.targets, load_rooms(None), config.validation)[1]
+    seen = make_split(config.split, config.validation, targets).seen
+    count = sum(map(len, seen.values()))
+    return "targets, each of a room type", "real rooms", count, _rates(row)
+
+
+def _config(row: Row) -> TrainConfig:
+    if row.config is None:
+        raise ValueError(f"{row.name}: no {CONFIG_FILE}")
+    return row.config
+
+
+def _rates(row: Row) -> dict[str, dict[str, float]]:
+    bucket = {group: row.results[group]["L>=1"] for group in GROUPS}
+    return {group: {m: bucket[group][m] for m in comparison.MEASURES} for group in GROUPS}
