@@ -115,12 +115,16 @@ def test_what_it_is_taught_is_where_done_succeeds() -> None:
     assert success.any()
     assert not taught.all()
     world, (_, params) = World(house.TABLES, house.WORTH, house.LIMITS), house.TASKS[True]
-    succeeds = jax.jit(dynamics.would_succeed)
-    for target, pose in np.ndindex(len(house.TABLES.targets), house.TABLES.num_states):
-        state = dynamics.start(jnp.int32(pose), jnp.int32(target), params)
-        assert bool(succeeds(state, params)) == (
-            house.TABLES.targets[target] in world.visible(pose)
-        )
+
+    @jax.jit
+    @jax.vmap
+    def succeeds(target: jax.Array, pose: jax.Array) -> jax.Array:
+        return dynamics.would_succeed(dynamics.start(pose, target, params), params)
+
+    shape = len(house.TABLES.targets), house.TABLES.num_states
+    found = np.asarray(succeeds(*np.indices(shape, np.int32).reshape(2, -1))).reshape(shape)
+    for target, pose in np.ndindex(shape):
+        assert found[target, pose] == (house.TABLES.targets[target] in world.visible(pose))
 
 
 def test_its_loss_is_the_cross_entropy_where_the_target_is_in_view() -> None:
