@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from tdanet_jax import sense_noise
 from tdanet_jax.config import TrainConfig, find_word_vectors, fits, with_reach_threshold
 from tdanet_jax.sense_noise import SenseNoise
 from tdanet_jax.splits import OPEN
-from tdanet_jax.targets import canonical, known_classes
+from tdanet_jax.targets import canonical, known_classes, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +26,9 @@ class EvalConfig:
     """File of word vectors, instead of the run's or the bundled ones. A run keeps a copy of the
     vectors it was trained with, and needs the file only if that lacks the rooms' classes."""
     test_targets: str | None = None
-    """Test on these targets instead of the run's, given as the training command takes them: paper,
-    all or names. Test episodes are those of a run with these targets."""
+    """Test on these targets instead of the run's, given as for training: paper, all or names. The
+    episodes are those of a run with these targets. "Seen" are then all of them that training did
+    not hide, whether or not it asked for them."""
     step_limit: int | None = None
     """Actions after which an episode ends, instead of the test's limits for each room type."""
     episodes: int | None = None
@@ -48,11 +50,8 @@ class EvalConfig:
             if value is not None and (not fits(value, int) or value < 1):
                 raise ValueError(f"--{name} {value}: must be a positive integer")
         if self.test_targets is not None:
-            try:
-                known_classes(self.test_targets, self.data)
-            except ValueError as error:
-                line = str(error).replace("--targets", "--test-targets", 1)
-                raise ValueError(line) from None
+            with self.naming_flags():
+                parse(self.test_targets)
         sense_noise.parse(self.noise or "none")
 
     @property
@@ -85,12 +84,6 @@ class EvalConfig:
             or there are other targets for a split that has its own.
         """
         run = Path(run)
-        if self.test_targets is not None:
-            if config.split == OPEN:
-                raise ValueError(
-                    f"--test-targets {self.test_targets}: {run} has the targets of --split {OPEN}"
-                )
-            config = dataclasses.replace(config, targets=canonical(self.test_targets))
         data = self.data
         if data is None and config.data is not None:
             data = config.data
@@ -99,9 +92,37 @@ class EvalConfig:
                     f"{data}: no such file; {run} was trained in these rooms: give the file's "
                     "place with --data"
                 )
+        config = self.with_targets(dataclasses.replace(config, data=data))
         words = find_word_vectors(config, run, self.word_vectors)
         config = with_reach_threshold(config.in_rooms_alone(), self.reach_threshold, run)
-        return dataclasses.replace(config, data=data, word_vectors=words)
+        return dataclasses.replace(config, word_vectors=words)
+
+    def with_targets(self, config: TrainConfig) -> TrainConfig:
+        """A configuration with the targets of the test, if they are given.
+
+        Raises:
+          ValueError: the rooms have no such class, or the split has targets of its own.
+        """
+        if self.test_targets is None:
+            return config
+        if config.split == OPEN:
+            raise ValueError(
+                f"--test-targets {self.test_targets}: --split {OPEN} has targets of its own"
+            )
+        with self.naming_flags():
+            known_classes(self.test_targets, config.data)
+            return dataclasses.replace(config, targets=canonical(self.test_targets))
+
+    @contextlib.contextmanager
+    def naming_flags(self) -> Iterator[None]:
+        """Errors inside say --test-targets where they say --targets and these are meant."""
+        try:
+            yield
+        except ValueError as error:
+            if self.test_targets is None or not str(error).startswith("--targets"):
+                raise
+            line = str(error).replace("--targets", "--test-targets", 1)
+            raise ValueError(line) from None
 
 
 def describe_departures(departures: Mapping[str, Any]) -> str:

@@ -135,7 +135,7 @@ def data_curve(
             axis.set_xticks([], minor=True)
             axis.grid(alpha=0.3)
             axis.spines[["top", "right"]].set_visible(False)
-            axis.set(xlabel=what if row is axes[-1] else "")
+            axis.set(xlabel=what if measure == MEASURES[-1] else "")
     labels = {
         label: line
         for axis in axes[0]

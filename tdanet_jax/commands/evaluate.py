@@ -91,9 +91,10 @@ def main(arguments: list[str] | None = None) -> None:
             validation=command.validation,
             seed=command.seed or 0,
         )
-        config.check()
         test = dataclasses.replace(command.test, noise=None) if sweep else command.test
         test.check()
+        if not trained:
+            test.with_targets(dataclasses.replace(config, data=test.data)).check()
         kind = f"noise-{command.policy}" if sweep else command.policy
         kind = f"history-{command.policy}" if command.history else kind
         folder = command.out or (*map(folder_for, command.checkpoint), Path("runs"))[0] / kind

@@ -19,7 +19,8 @@ from tdanet_jax.eval_config import describe_departures
 from tdanet_jax.evaluation import metrics, paper
 from tdanet_jax.evaluation.metrics import BUCKETS
 from tdanet_jax.io.escaping import in_markdown
-from tdanet_jax.splits import GROUPS
+from tdanet_jax.splits import GROUPS, OPEN
+from tdanet_jax.targets import PAPER
 
 Result = Mapping[str, Any]
 #: The records of a network by group, as the columns of `report.columns`.
@@ -245,10 +246,14 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
         ]
         rows += (differing := list(_differences(own, names)))
         rows += _means(own, names)
-        published = {} if departures else paper.rates(split, own[0].get("targets"))
+        targets = [*dict.fromkeys(result.get("targets") or PAPER for result in own)]
+        compared = targets == [PAPER] and not departures
+        published = paper.rates(split, PAPER) if compared else {}
         for agent, groups in published.items():
             rows.append(((f"{agent} (paper)", "", "", ""), groups))
         lines += ["", f"## Split {split}", ""]
+        if {*targets} - {PAPER, OPEN}:
+            lines += [f"Targets: {in_markdown('; '.join(targets))}.", ""]
         lines += table(("Agent", "Updates", "Training episodes", "Actions"), rows)
         if differing:
             lines += ["", "Differences: in the same episodes, 95 % intervals (paired bootstrap)."]

@@ -76,7 +76,8 @@ class Provenance:
     image: str | None = None  # the image that the model is shown, if there is one
     sensors: tuple[str, ...] = ()  # names of the agent's sensors; the paper's agents have none
     departures: Mapping[str, Any] | None = None  # from the official test, if there are any
-    targets: str = PAPER  # `TrainConfig.targets`, or "data" if the rooms name their own
+    targets: str = PAPER  # those of the test: as in `TrainConfig`, or "data" if the rooms name them
+    trained_targets: str | None = None  # those of the training, if they are others
 
     @classmethod
     def of(
@@ -88,17 +89,19 @@ class Provenance:
         episodes: int = 0,
         updates: int = 0,
         departures: Mapping[str, Any] | None = None,
+        trained_targets: str | None = None,
     ) -> Provenance:
         """The provenance of a network's results, or of a policy's without a network.
 
         Args:
           task: what was played.
-          config: the network's run, with the rooms of the evaluation.
+          config: the network's run, with the rooms and targets of the evaluation.
           policy: "sample" or "greedy" for networks, else the policy's name.
           evaluation_seed: of the actions sampled in the test episodes.
           episodes: training episodes of the network.
           updates: training updates of the network.
           departures: from the official test (`EvalConfig.departures`).
+          trained_targets: the run's own.
         """
         network = policy in ("sample", "greedy")
         own = config.targets == PAPER and task.extras is not None and task.extras.targets
@@ -116,6 +119,7 @@ class Provenance:
             sensors=task.spec.sensors if network else (),
             departures=departures or None,
             targets="data" if own else config.sought,
+            trained_targets=None if trained_targets == config.targets else trained_targets,
         )
 
 
@@ -257,6 +261,14 @@ def all_rows(tables: SceneTables, played: Played) -> Iterator[dict[str, Any]]:
         yield from episode_rows(name, columns(tables, episodes, records), records)
 
 
+def trained_for(out: Mapping[str, Any]) -> list[str]:
+    """A sentence on an agent that was trained for other targets than those of its test."""
+    if out.get("trained_targets") is None:
+        return []
+    targets = in_markdown(out["trained_targets"])
+    return [f"Trained for the targets {targets}; *seen* means that training did not hide them."]
+
+
 def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
     """`results.md`: tables as in the paper, with the paper's rows next to ours."""
     agent = ObservationSpec(sensors=tuple(out["sensors"])).agent_name(out["model"])
@@ -270,6 +282,7 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
         f"{out['data_version']}, code {out['commit']}.",
         *(["", f"**{in_markdown(describe_departures(departures))}.**", ""] if departures else []),
         *([f"Targets: {in_markdown(out['targets'])}."] if out["targets"] != PAPER else []),
+        *trained_for(out),
         *(f"{n.capitalize()}: {in_markdown(out[n])}." for n in ("data", "image") if out[n]),
         "",
         "SR and SPL in percent, with 95 % bootstrap intervals over "

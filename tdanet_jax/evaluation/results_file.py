@@ -44,7 +44,7 @@ def check(path: Path, results: Any) -> None:
         raise FileError(path, error) from None
     if canonical != name:  # it becomes part of the names of pictures
         raise FileError(path, f"split {results['split']}: not the name of a split")
-    for name in ("data", "targets"):
+    for name in ("data", "targets", "trained_targets"):
         if not isinstance(results.get(name), str | None):
             raise FileError(path, f"{name} is not text")
     check_groups(path, results, "")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from tdanet_jax.io.untrusted import regular
 from tdanet_jax.models import classes
 from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
 from tdanet_jax.scenes.dataset import Rooms, find_targets, load_rooms
+from tdanet_jax.splits import make_split
 from tdanet_jax.task import Task, task_in
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import Checkpoints, is_shared, newest
@@ -168,10 +169,13 @@ def evaluate(
         noiseless = dataclasses.replace(network.test, noise=None)
         groups.setdefault((_task_config(network), noiseless), []).append(network)
     for members in groups.values():
-        located = members[0].located
+        located, test = members[0].located, members[0].test
         rooms = load_rooms(located.data)
-        task = task_in(rooms, located)
-        params, lists = selection.select(task, members[0].test)
+        with test.naming_flags():
+            task = task_in(rooms, located)
+        own = {network.config.sought: network.config for network in members}
+        versions = {sought: _version(task, rooms, config, test) for sought, config in own.items()}
+        params, lists = selection.select(task, test)
         policy = policies.network(task.model, task.words, greedy)
         expected = task.model.parameter_shapes(*task.words.shape)
         width = None if located.word_vectors is None else task.words.shape[1]
@@ -181,7 +185,7 @@ def evaluate(
         together = 1 if alone else TOGETHER
         for start in range(0, len(members), together):
             part, params = members[start : start + together], worlds[start]
-            snapshots = [_checked(network, task, rooms) for network in part]
+            snapshots = [_checked(network, task, versions) for network in part]
             for network, snapshot in zip(part, snapshots, strict=True):
                 of = network.point or network.run
                 history.check_fit(of, snapshot.weights, expected, width)
@@ -192,7 +196,9 @@ def evaluate(
             # In parallel, adaptive networks would take their inner steps in every step.
             batched = False if isinstance(task.model, AdaptiveActorCritic) else None
             played = rollout.evaluate_stacked(policy, weights, params, lists, seeds, batched)
-            for network, snapshot, own, drawn in zip(part, snapshots, played, seeds, strict=True):
+            for network, snapshot, records, drawn in zip(
+                part, snapshots, played, seeds, strict=True
+            ):
                 yield Evaluated(
                     saved=network,
                     snapshot=dataclasses.replace(snapshot, weights=None),
@@ -207,8 +213,9 @@ def evaluate(
                         snapshot.episodes,
                         snapshot.updates,
                         network.test.departures,
+                        network.config.targets,
                     ),
-                    played=own,
+                    played=records,
                 )
 
 
@@ -225,14 +232,31 @@ def _task_config(network: SavedNetwork) -> TrainConfig:
     return TrainConfig(**values)
 
 
-def _checked(network: SavedNetwork, task: Task, rooms: Rooms) -> Snapshot:
-    snapshot, tables = network.load(), task.tables
-    if network.test.test_targets is not None:  # tables with other targets have another version
-        tables = find_targets(network.config.sought, rooms, network.config.validation)[0]
-    if network.test.data is None and snapshot.data_version != tables.data_version:
+def _version(task: Task, rooms: Rooms, config: TrainConfig, test: EvalConfig) -> str:
+    """The version of the tables that runs were trained on, which depends on their targets.
+
+    Raises:
+      ValueError: a target of the test that should be unseen was a target in training.
+    """
+    if test.test_targets is None or test.data is not None:  # other rooms have no version to check
+        return task.tables.data_version
+    tables, own = find_targets(config.sought, rooms, config.validation)
+    hidden = make_split(config.split, config.validation, own).hidden
+    unseen = {name for names in task.split.unseen.values() for name in names}
+    if known := sorted(unseen - hidden):
+        raise ValueError(
+            f"--test-targets {test.test_targets}: would have {', '.join(known)} as unseen, which "
+            "training did not hide"
+        )
+    return tables.data_version
+
+
+def _checked(network: SavedNetwork, task: Task, versions: Mapping[str, str]) -> Snapshot:
+    snapshot, version = network.load(), versions[network.config.sought]
+    if network.test.data is None and snapshot.data_version != version:
         raise ValueError(
             f"{network.point or network.run}: trained on scene tables {snapshot.data_version}, "
-            f"these are {tables.data_version}"
+            f"these are {version}"
         )
     task.check_known(network.run, classes.load_vocabulary(network.run).names)
     return snapshot

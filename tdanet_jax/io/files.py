@@ -153,8 +153,8 @@ def locked(folder: Path, wait: bool = False, name: str = LOCK_FILE) -> Iterator[
     try:
         yield
     except BaseException:
-        if created and [*folder.iterdir()] == [path]:
-            path.unlink()
+        if created and {*folder.iterdir()} <= {path}:
+            path.unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # another process has come to use them
                 for place in created:
                     place.rmdir()

@@ -38,6 +38,9 @@ UNUSED_DAYS = 30
 #: that it has read.
 TABLES, VARIANTS, GENERATED = "ithor-", "variants-", "generated-"
 DISTANCES, IMPORTS = "distances-", "import-"
+#: What the name of a file's lock ends with. It is removed with the lock, unless the process is
+#: killed.
+LOCK = ".lock"
 MODULES = (
     "io.archive",
     "poses",
@@ -120,7 +123,7 @@ def load(name: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, n
     if (found := _read(path)) is not None:
         return found
     with contextlib.ExitStack() as stack:
-        _lock(stack, f".{path.stem}.lock")
+        _lock(stack, path)
         if (found := _read(path)) is not None:
             return found
         if path.exists():
@@ -136,16 +139,22 @@ def load(name: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, n
     return result
 
 
-def _lock(stack: contextlib.ExitStack, name: str) -> None:
-    """Holds a lock until `stack` unwinds, unless the cache cannot be written."""
-    try:
-        stack.enter_context(files.locked(folder(), name=name))
-    except BlockingIOError:
-        warnings.warn("another process computes the rooms' tables: waiting for it", stacklevel=3)
-        stack.enter_context(files.locked(folder(), wait=True, name=name))
-    except OSError:
-        return
-    stack.callback((folder() / name).unlink, missing_ok=True)
+def _lock(stack: contextlib.ExitStack, path: Path) -> None:
+    """Holds the lock of a file until `stack` unwinds, unless the cache cannot be written."""
+    name = f".{path.stem}{LOCK}"
+    with contextlib.suppress(OSError):
+        try:
+            stack.enter_context(files.locked(path.parent, name=name))
+        except BlockingIOError:
+            what = f"another process computes {path.name}: waiting for it"
+            warnings.warn(what, stacklevel=3)
+            stack.enter_context(files.locked(path.parent, wait=True, name=name))
+        stack.callback(_remove, path.parent / name)
+
+
+def _remove(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        path.unlink()
 
 
 def _read(path: Path) -> dict[str, np.ndarray] | None:
@@ -166,12 +175,15 @@ def touch(path: Path) -> None:
 
 
 def _remove_unused(place: Path) -> None:
-    """Removes tables, distances and scenes of imports that have long been unused; holds the lock.
+    """Removes tables, distances, locks and scenes of imports that have long been unused; holds the
+    folder's lock.
 
     A process that reads them has them open, or computes again what it does not find.
     """
     oldest = time.time() - UNUSED_DAYS * 86400
-    kinds = [*(f"{kind}*.npz" for kind in (TABLES, VARIANTS, GENERATED, DISTANCES)), f"{IMPORTS}*"]
+    stored = (TABLES, VARIANTS, GENERATED, DISTANCES)
+    kinds = [*(f"{kind}*.npz" for kind in stored), *(f".{kind}*{LOCK}" for kind in stored)]
+    kinds.append(f"{IMPORTS}*")
     for path in [path for kind in kinds for path in place.glob(kind)]:
         with contextlib.suppress(OSError):
             if path.stat().st_mtime >= oldest:
@@ -180,7 +192,7 @@ def _remove_unused(place: Path) -> None:
                 shutil.rmtree(path)
             else:
                 path.unlink()
-                path.with_suffix(".sha256").unlink()
+                _remove(path.with_suffix(".sha256"))
 
 
 def _store(result: dict[str, np.ndarray], path: Path) -> None:

@@ -116,9 +116,10 @@ def _evaluate_policy(
             known = ", ".join(UNTRAINED)
             raise ValueError(f"policy {policy}: needs a checkpoint, or choose one of {known}")
         policy = UNTRAINED[policy]()
-    given = {"data": test.data, "word_vectors": test.word_vectors, "targets": test.test_targets}
-    chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    config = dataclasses.replace(config, **chosen)
+    files = {"data": test.data, "word_vectors": test.word_vectors}
+    chosen: dict[str, Any] = {name: path for name, path in files.items() if path is not None}
+    config = test.with_targets(dataclasses.replace(config, **chosen))
+    config.check()
     task, seed = load_task(config), config.seed if seed is None else seed
     params, lists = selection.select(task, test)
     params = selection.with_senses(task, params, [test.senses])[0]

@@ -227,6 +227,8 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
     ]
     if first["departures"]:
         lines += ["", f"**{in_markdown(describe_departures(first['departures']))}.**"]
+    if first.get("test_targets") is not None:
+        lines += ["", f"Targets: {in_markdown(first['test_targets'])}."]
     heads = ["Level", "Agent", *(f"{group} {m}" for group in GROUPS for m in MEASURES)]
     clean = {row["agent"]: row for row in rows if row["kind"] is None}
     for kind in dict.fromkeys(row["kind"] for row in rows):

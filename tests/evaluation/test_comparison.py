@@ -69,6 +69,17 @@ def test_a_page_without_rows_of_the_paper_does_not_speak_of_its_world():
     assert "worlds differ" not in page
 
 
+def test_the_page_says_which_targets_were_tested():
+    others = [result(0) | {"targets": "Kettle,Mug"}, result(1) | {"targets": "Kettle,Mug"}]
+    page = comparison.markdown("Two", others, ["a", "b"])
+    assert "Targets: Kettle,Mug." in page
+    assert "(paper)" not in page
+    papers = [result(0) | {"targets": "paper"}, result(1)]  # the first results did not say it
+    page = comparison.markdown("Two", papers, ["a", "b"])
+    assert "Targets:" not in page
+    assert "(paper)" in page
+
+
 def test_a_history_is_not_averaged_over_its_points():
     page = comparison.markdown("Two", [result(point=0), result(point=1)], ["a", "a"])
     assert "seeds" not in page
@@ -229,3 +240,22 @@ def test_the_figure_is_drawn_with_and_without_unseen_targets(tmp_path):
     ]
     figures.evaluated_curves(curves, "Two", tmp_path / "curve.png")
     assert (tmp_path / "curve.png").stat().st_size > 10_000
+
+
+def test_what_was_counted_is_written_under_the_panels_of_the_data_curve(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures.drawing, "save", lambda figure, *rest: drawn.append(figure))
+    found = {group: {"SR": 90.0, "SPL": 50.0} for group in ("seen", "unseen")}
+    points = [
+        ("rooms", "real", 64, found),
+        ("rooms", "more", 640, found),
+        ("targets", "", 9, found),
+    ]
+    figures.data_curve(points, tmp_path / "curve.png")
+    axes = np.reshape(drawn[0].axes, (2, 4))
+    assert [axis.get_xlabel() for axis in axes[0]] == [""] * 4
+    assert [axis.get_xlabel() for axis in axes[1]] == ["rooms"] * 2 + ["targets"] * 2
+    for row, measure in zip(axes, ("SR", "SPL"), strict=True):
+        for axis, group in zip(row, ("seen", "unseen") * 2, strict=True):
+            assert axis.get_ylabel() == f"{group} targets, {measure}, per cent"
+            assert {*axis.lines[0].get_ydata()} == {found[group][measure]}

@@ -16,7 +16,7 @@ BUCKET = {*MEASURES, *(f"{measure}_ci" for measure in MEASURES), "n"}
 TOP = [
     "version", "split", "model", "policy", "episodes_trained", "seen", "unseen", "by_room",
     "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "sensors",
-    "departures", "targets", "odometry", "triangulation", "commit",
+    "departures", "targets", "trained_targets", "odometry", "triangulation", "commit",
 ]  # fmt: skip
 
 

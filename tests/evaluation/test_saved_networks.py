@@ -113,6 +113,8 @@ def test_a_run_is_tested_on_the_targets_of_another(
                 key: done[key] for key in (*GROUPS, "by_target", "targets", "data_version")
             }
             assert done["departures"] is None
+            other = {"paper": "mug, kettle", "others": "paper"}[name]
+            assert done["trained_targets"] == (config.targets if test == other else None)
     assert found["paper", None] == found["paper", "paper"] == found["others", "paper"]
     assert found["others", None] == found["others", "mug, kettle"] == found["paper", "mug, kettle"]
     assert {*found["paper", "mug, kettle"]["by_target"]} == {"Kettle", "Mug"}
@@ -134,10 +136,18 @@ def test_other_targets_hide_no_other_rooms(
     [
         (TINY, "ketle", "--test-targets ketle: no class of these rooms; did you mean Kettle"),
         (TINY, "Mug,,", "--test-targets Mug,,: a name is missing"),
+        (TINY, "kitchen: Boots", "--test-targets Boots: can be found in no training room of type"),
         (
             dataclasses.replace(TINY, split="open"),
             "Mug",
-            "--test-targets Mug: .*run has the targets of --split open",
+            "--test-targets Mug: --split open has targets of its own",
+        ),
+        # Bread is what validation holds out; without it, the first of the kitchen's targets.
+        (
+            dataclasses.replace(TINY, validation=True),
+            "kitchen: Spatula, Mug",
+            "--test-targets kitchen: Spatula, Mug: would have Spatula as unseen, which training "
+            "did not hide",
         ),
     ],
 )

@@ -15,6 +15,7 @@ import pytest
 import tdanet_jax
 from tdanet_jax import EvalConfig
 from tdanet_jax.commands import evaluate
+from tdanet_jax.config import TrainConfig
 from tdanet_jax.env.params import TEST_STEP_LIMITS
 from tdanet_jax.eval_config import OWN_TASK, describe_departures
 from tdanet_jax.evaluation import comparison, episodes, selection
@@ -148,6 +149,29 @@ def test_the_results_say_that_it_is_not_the_test(
     assert len(records) == 20
     assert all(record["success"] == (record["L"] <= 3) for record in records)
     assert max(record["e"] for record in records) == 3
+
+
+def test_a_policy_is_tested_on_any_targets(
+    tmp_path: Path, few_episodes: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    given = ["--policy", "random", "--split", "Kettle", "--test-targets"]
+    evaluate.main([*given, "kettle, mug,book", "--out", str(out)])
+    results = json.loads((out / "results.json").read_text())
+    assert {*results["by_target"]} == {"Kettle", "Mug", "Book"}
+    assert (results["split"], results["targets"]) == ("Kettle", "Mug,Book,Kettle")
+    assert results["departures"] is None
+    for targets, error in {
+        "Mug,Book": "--split Kettle: choose one of",
+        "ketle": "--test-targets ketle: no class of these rooms; did you mean Kettle",
+    }.items():
+        with pytest.raises(SystemExit):
+            evaluate.main([*given, targets, "--out", str(tmp_path / "no")])
+        assert error in capsys.readouterr().err
+    with pytest.raises(ValueError, match="--test-targets Mug: --split open has targets of its own"):
+        tdanet_jax.evaluate(
+            None, "random", config=TrainConfig(split="open"), test=EvalConfig(test_targets="Mug")
+        )
 
 
 @pytest.mark.slow

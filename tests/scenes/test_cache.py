@@ -146,10 +146,36 @@ def test_nobody_waits_for_what_he_does_not_need(
     assert len(files_of(tmp_path)) == 4
 
 
+def test_what_cannot_be_computed_leaves_nothing(folder: Path) -> None:
+    with pytest.raises(RuntimeError, match="no rooms"):
+        cache.load("variants-1.npz", stopped)
+    assert not folder.exists()
+    cache.load("variants-2.npz", lambda: {"distance": np.arange(3)})
+    with pytest.raises(RuntimeError, match="no rooms"):
+        cache.load("variants-1.npz", stopped)
+    assert {path.name for path in files_of(folder)} == {"variants-2.npz", "variants-2.sha256"}
+
+
+def stopped() -> dict[str, np.ndarray]:
+    raise RuntimeError("no rooms")
+
+
+def test_a_lock_that_cannot_be_removed_loses_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, missing_ok: bool = False) -> None:
+        raise PermissionError("not yours")
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    found = cache.load("variants-1.npz", lambda: {"distance": np.arange(3)})
+    assert found["distance"].tolist() == [0, 1, 2]
+
+
 def test_a_killed_builder_leaves_no_lock_and_no_partial_file(tmp_path: Path) -> None:
     killed = start_building(tmp_path)
     assert killed.stdout is not None
     assert killed.stdout.readline() == "building\n"
+    assert {path.name for path in files_of(tmp_path)} == {f".ithor-{cache.key()}.lock"}
     killed.kill()
     killed.communicate()
     (tmp_path / f"{files.PARTIAL}{killed.pid}-tables.npz").write_text("half")
@@ -179,9 +205,13 @@ def test_unused_files_are_removed(folder: Path, monkeypatch: pytest.MonkeyPatch)
     cache.touch(folder / "ithor-used.npz")  # as reading them does
     cache.touch(folder / "import-1-used")
     cache.touch(folder / "nowhere")
+    for name in (".variants-old.lock", ".variants-new.lock"):  # of builders that were killed
+        (folder / name).touch()
+    os.utime(folder / ".variants-old.lock", (before, before))
     monkeypatch.setattr(cache, "key", lambda: "now")
     cache.load_tables()
     left = {"ithor-now.npz", "ithor-now.sha256", "compiled", "mine.npz", files.LOCK_FILE}
+    left.add(".variants-new.lock")
     for name in ("used", "new"):
         left |= {f"ithor-{name}.npz", f"ithor-{name}.sha256", f"import-1-{name}"}
     assert {path.name for path in folder.iterdir()} == left

@@ -375,7 +375,7 @@ FAULTS = (
           "io/test_files.py"),
     Fault("half-written files stay", "io/files.py", "        shutil.rmtree(folder, ignore_errors=True)\n",
           "        pass\n", "io/test_files.py"),
-    Fault("cache built by all at once", "scenes/cache.py", "stack.enter_context(files.locked(folder(), name=name))", "pass",
+    Fault("cache built by all at once", "scenes/cache.py", "stack.enter_context(files.locked(path.parent, name=name))", "pass",
           "scenes/test_cache.py"),
     Fault("cache read unchecked", "scenes/cache.py", "== assets.sha256(path)", "!= ''",
           "scenes/test_cache.py"),
