@@ -32,12 +32,17 @@ class Add:
     """The one plain command by which it was made, in quotes, if its run.json does not tell."""
     machine: str | None = None
     """Where it was made, such as "AMD EPYC 7B13, 2 cores", if its run.json does not tell."""
+    evaluation: Path | None = None
+    """Folder that `tdanet evaluate --test-targets paper` wrote, if the run was trained for other
+    targets."""
 
     def run(self) -> None:
         """Runs the command."""
         from tdanet_jax.workflows import scoreboard
 
-        out = scoreboard.add(self.folder, self.name, RESULTS, self.command, self.machine)
+        out = scoreboard.add(
+            self.folder, self.name, RESULTS, self.command, self.machine, self.evaluation
+        )
         console.print(f"wrote {out.relative_to(ROOT)}; now run the same tool with write")
 
 

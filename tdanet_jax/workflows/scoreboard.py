@@ -40,6 +40,8 @@ from tdanet_jax.workflows.evaluate import UNTRAINED
 
 #: Flags that do not tell agents apart here. The last two are what "auto" became on a machine.
 _SHARED = (*comparison.NOT_SETTINGS, "--split", "--model", "--precision", "--image")
+#: Flags without effect where variants and generated rooms fit into one pool.
+_POOLS = ("--pool-rooms", "--pool-updates")
 #: The folder in `results/` of runs with `--validation`; the names of their rows begin with it.
 VALIDATION = "validation/"
 #: The value of `model` in the `results.json` of a custom policy.
@@ -99,10 +101,14 @@ class Row:
 def _differing(config: TrainConfig, preset: TrainConfig) -> list[str]:
     """The flags in which a configuration differs from a preset, with its values, as typed.
 
-    A limit of the preset that it has not is left out: another one takes its place.
+    A limit of the preset that it has not is left out: another one takes its place. So are flags of
+    pools, if there is only one.
     """
     values, usual = comparison.flags(config), comparison.flags(preset)
     absent = {f"--{name}" for name in BUDGETS if getattr(config, name) is None}
+    own = len(make_split("22/0", config.validation).train_scenes)
+    if config.variants * own + config.generated <= config.pool_rooms:
+        absent |= {*_POOLS}
     return [
         _typed(flag, value)
         for flag, value in values.items()
@@ -165,6 +171,7 @@ def add(
     folder: Path | str,
     command: str | None = None,
     machine: str | None = None,
+    evaluation: Path | str | None = None,
 ) -> Path:
     """Copies what a row needs of a finished run, or of an evaluation that needs no run.
 
@@ -176,6 +183,8 @@ def add(
       folder: the folder of all rows.
       command: by which it was made, if its `run.json` does not tell.
       machine: on which, if its `run.json` does not tell.
+      evaluation: the folder of its results, if it was trained for other targets than those of the
+        test: what `tdanet evaluate --test-targets paper` wrote.
 
     Returns:
       The folder of the row.
@@ -197,11 +206,17 @@ def add(
     if not (run / report.RESULTS_FILE).exists():
         raise FileError(run / report.RESULTS_FILE, "no such file; is the run finished?")
     row = dataclasses.replace(read(run), name=name)
-    processes = _processes(run, row, command, machine)
+    processes, played = _processes(run, row, command, machine), run
+    if evaluation is not None:
+        played = Path(evaluation)
+        results = _evaluated(played, row.results)
+        row = dataclasses.replace(row, results=results)
+        again = f"tdanet evaluate --checkpoint {run.name} --test-targets {results['targets']}"
+        processes.append(Process(command=again, commit=results["commit"]))
     for commit in (row.results.get("commit"), *(process.commit for process in row.processes)):
         if str(commit).endswith("-dirty"):
             raise ValueError(f"{run}: made with changes that are not committed, {commit}")
-    check(run, row)
+    check(played, row)
     if row.config is not None:
         row = dataclasses.replace(row, config=_without_folders(row.config))
     for other in rows(folder):
@@ -217,11 +232,29 @@ def add(
             (fresh / METRICS_FILE).write_bytes(metrics)
         run_file.write(fresh, processes)
         if not row.of_validation:
-            records = regular.read_bytes(run / report.EPISODES_FILE, links=False)
+            records = regular.read_bytes(played / report.EPISODES_FILE, links=False)
             (fresh / report.EPISODES_FILE).write_bytes(records)
-        results = regular.read_bytes(run / report.RESULTS_FILE, links=False)
-        (fresh / report.RESULTS_FILE).write_bytes(results)
+        content = regular.read_bytes(played / report.RESULTS_FILE, links=False)
+        (fresh / report.RESULTS_FILE).write_bytes(content)
     return out
+
+
+def _evaluated(folder: Path, own: Result) -> Result:
+    """The results in a folder. Raises ValueError unless they are of the run with these results."""
+    results = results_file.read(folder / report.RESULTS_FILE)
+    for name in (
+        "model",
+        "split",
+        "policy",
+        "seed",
+        "evaluation_seed",
+        "steps",
+        "episodes_trained",
+    ):
+        if results[name] != own[name]:
+            text = f"{name} {results[name]}: the run has {own[name]}"
+            raise FileError(folder / report.RESULTS_FILE, text)
+    return results
 
 
 def check(run: Path, row: Row) -> None:

@@ -241,12 +241,12 @@ def _room_point(row: Row) -> Point:
     config = _config(row)
     own = len(make_split(config.split, config.validation).train_scenes)
     kinds = {
-        "real": 0 if config.generated_only else own,
-        f"variants of the {own}": config.variants * own,
-        "generated": config.generated,
+        "real rooms": 0 if config.generated_only else own,
+        "variants": config.variants * own,
+        "generated rooms": config.generated,
     }
     kind = " and ".join(name for name, count in kinds.items() if count)
-    return "training rooms", f"{kind} rooms", sum(kinds.values()), _rates(row)
+    return "training rooms", kind, sum(kinds.values()), _rates(row)
 
 
 def _target_point(row: Row) -> Point | None:
@@ -263,7 +263,7 @@ def _target_point(row: Row) -> Point | None:
         targets = find_targets(config.targets, load_rooms(None), config.validation)[1]
     seen = make_split(config.split, config.validation, targets).seen
     count = sum(map(len, seen.values()))
-    return "targets, each of a room type", "real rooms", count, _rates(row)
+    return "pairs of a room type and a target", "real rooms", count, _rates(row)
 
 
 def _config(row: Row) -> TrainConfig:

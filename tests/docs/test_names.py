@@ -18,8 +18,8 @@ from tests.support.pages import PAGES, ROOT, prose
 
 #: Flags of other programs, and of the examples, that the pages mention.
 FOREIGN = {
-    "--array", "--check", "--durations", "--fix", "--gpus-per-node", "--gpus-per-task", "--help",
-    "--total-timesteps",
+    "--array", "--check", "--durations", "--evaluation", "--fix", "--gpus-per-node",
+    "--gpus-per-task", "--help", "--total-timesteps",
     "--xla_cpu_multi_thread_eigen", "--xla_gpu_deterministic_ops",
 }  # fmt: skip
 #: Where the files are that a page may name.

@@ -332,6 +332,33 @@ def test_runs_for_choosing_settings_stand_apart(of_validation: Path, tmp_path: P
         )
 
 
+def test_a_run_for_other_targets_has_the_results_of_its_evaluation(
+    of_validation: Path, tmp_path: Path
+) -> None:
+    results, played = tmp_path / "results", tmp_path / "played"
+    shutil.copytree(of_validation, played)
+    (played / "config.json").unlink()
+    edit(of_validation / "config.json", targets="all")
+    edit(of_validation / "results.json", targets="all", data_version="of others")
+    edit(played / "results.json", trained_targets="all", commit="0123456789ab")
+    with pytest.raises(ValueError, match="of scene tables of others, today's are"):
+        scoreboard.add(of_validation, "validation/all", results)
+    edit(played / "results.json", seed=8)
+    with pytest.raises(ValueError, match=r"played/results.json: seed 8: the run has 7$"):
+        scoreboard.add(of_validation, "validation/all", results, evaluation=played)
+    edit(played / "results.json", seed=7)
+    out = scoreboard.add(of_validation, "validation/all", results, evaluation=played)
+    (row,) = scoreboard.rows(results)
+    assert (row.results["targets"], row.config and row.config.targets) == ("paper", "all")
+    assert row.metrics
+    *before, last = run_file.read(out)
+    assert [process.commit for process in before] == [
+        process.commit for process in run_file.read(of_validation)
+    ]
+    assert last.command == "tdanet evaluate --checkpoint run --test-targets paper"
+    assert last.commit == "0123456789ab"
+
+
 def test_rooms_and_targets_and_what_they_give_are_drawn(
     of_validation: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -364,10 +391,10 @@ def test_rooms_and_targets_and_what_they_give_are_drawn(
     assert {(what, kind, count) for what, kind, count, _ in points} == {
         ("training rooms", "generated rooms", 1000),
         ("training rooms", "real rooms", 64),
-        ("training rooms", "real and variants of the 64 rooms", 192),
-        ("targets, each of a room type", "real rooms", 14),
-        ("targets, each of a room type", "real rooms", 2),
-        ("targets, each of a room type", "real rooms", 180),
+        ("training rooms", "real rooms and variants", 192),
+        ("pairs of a room type and a target", "real rooms", 14),
+        ("pairs of a room type and a target", "real rooms", 2),
+        ("pairs of a room type and a target", "real rooms", 180),
     }
     assert all(found["unseen"] == {m: unseen[m] for m in ("SR", "SPL")} for *_, found in points)
     assert imread(picture).std() > 0.01
@@ -385,6 +412,18 @@ def test_an_agent_is_called_by_its_flags() -> None:
         (
             dataclasses.replace(paper, episodes=None, minutes=9.0),
             "tdanet --preset paper --minutes 9.0",
+        ),
+        (  # 1,500 rooms are one pool, and one more are two
+            dataclasses.replace(BEST, generated=1500, pool_updates=9),
+            "tdanet --preset best --generated 1500",
+        ),
+        (
+            dataclasses.replace(BEST, generated=1501, pool_updates=9),
+            "tdanet --preset best --generated 1501 --pool-updates 9",
+        ),
+        (
+            dataclasses.replace(BEST, variants=19, pool_updates=9),
+            "tdanet --preset best --variants 19 --pool-updates 9",
         ),
     ):
         assert dataclasses.replace(row, config=config).agent == agent
