@@ -17,7 +17,7 @@ from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.registry import MODELS, SENSORS
 from tdanet_jax.splits import OPEN, file_name, make_split, split_name
 from tdanet_jax.targets import PAPER as PAPER_TARGETS
-from tdanet_jax.targets import canonical, known_classes
+from tdanet_jax.targets import canonical, known_classes, naming
 
 #: Environment steps of a run without a budget.
 DEFAULT_STEPS = 12_000_000
@@ -188,6 +188,9 @@ class TrainConfig:
     validation: bool = False
     """For choosing settings: train in 16 of the 20 training rooms of each type with one more class
     held out, and evaluate in the other four."""
+    extra_targets: str | None = None
+    """Targets that training asks for as well, in about half of its episodes: all, or names, as
+    --targets takes them, without those that the split hides. The test is of --targets alone."""
     variants: int = 0
     """Variants of each training room to train in as well: small objects elsewhere, some left out,
     half of the variants mirrored (docs/scenes.md). They are built once and cached."""
@@ -232,6 +235,9 @@ class TrainConfig:
         split_name(self.split, known_classes(self.targets, self.data))
         if self.targets == PAPER_TARGETS and self.data is None:
             make_split(self.split, self.validation)
+        if self.extra_targets is not None:
+            with naming("--extra-targets"):
+                known_classes(self.extra_targets, self.data)
         if self.model not in MODELS and "." not in self.model:
             known = ", ".join(MODELS)
             raise ValueError(f"--model {self.model}: choose one of {known}, or name a module")
@@ -259,8 +265,10 @@ class TrainConfig:
         self.network.spec.check()
 
     def in_rooms_alone(self) -> TrainConfig:
-        """The same without variants and generated rooms, which are only for training."""
-        return dataclasses.replace(self, variants=0, generated=0, generated_only=False)
+        """The same without what is only for training: extra targets, variants, generated rooms."""
+        return dataclasses.replace(
+            self, extra_targets=None, variants=0, generated=0, generated_only=False
+        )
 
     def normalised(self) -> TrainConfig:
         """The same run as it is saved: with the canonical name of its split, and absolute paths."""
@@ -272,6 +280,7 @@ class TrainConfig:
             self,
             split=split_name(self.split, None),
             targets=canonical(self.targets),
+            extra_targets=self.extra_targets and canonical(self.extra_targets),
             data=absolute(self.data),
             word_vectors=absolute(self.word_vectors),
         )

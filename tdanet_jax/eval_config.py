@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from tdanet_jax import sense_noise
 from tdanet_jax.config import TrainConfig, find_word_vectors, fits, with_reach_threshold
 from tdanet_jax.sense_noise import SenseNoise
 from tdanet_jax.splits import OPEN
-from tdanet_jax.targets import canonical, known_classes, parse
+from tdanet_jax.targets import canonical, known_classes, naming, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +49,7 @@ class EvalConfig:
             if value is not None and (not fits(value, int) or value < 1):
                 raise ValueError(f"--{name} {value}: must be a positive integer")
         if self.test_targets is not None:
-            with self.naming_flags():
+            with naming("--test-targets"):
                 parse(self.test_targets)
         sense_noise.parse(self.noise or "none")
 
@@ -109,20 +108,9 @@ class EvalConfig:
             raise ValueError(
                 f"--test-targets {self.test_targets}: --split {OPEN} has targets of its own"
             )
-        with self.naming_flags():
+        with naming("--test-targets"):
             known_classes(self.test_targets, config.data)
-            return dataclasses.replace(config, targets=canonical(self.test_targets))
-
-    @contextlib.contextmanager
-    def naming_flags(self) -> Iterator[None]:
-        """Errors inside say --test-targets where they say --targets and these are meant."""
-        try:
-            yield
-        except ValueError as error:
-            if self.test_targets is None or not str(error).startswith("--targets"):
-                raise
-            line = str(error).replace("--targets", "--test-targets", 1)
-            raise ValueError(line) from None
+        return dataclasses.replace(config, targets=canonical(self.test_targets))
 
 
 def describe_departures(departures: Mapping[str, Any]) -> str:

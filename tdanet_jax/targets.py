@@ -5,7 +5,8 @@ Which of them can be found in which rooms is for `tdanet_jax.scenes.dataset.find
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import contextlib
+from collections.abc import Collection, Iterator
 
 from tdanet_jax import labels
 from tdanet_jax.splits import in_order, is_plain, known_type, labels_of
@@ -15,6 +16,18 @@ from tdanet_jax.vocabulary import ALL_TARGETS
 PAPER = "paper"
 #: Every class that can be found in a training room, by room type.
 ALL = "all"
+
+
+@contextlib.contextmanager
+def naming(flag: str) -> Iterator[None]:
+    """Errors inside that begin with --targets begin with this flag instead."""
+    try:
+        yield
+    except ValueError as error:
+        head, _, rest = str(error).partition(" ")
+        if head != "--targets":
+            raise
+        raise ValueError(f"{flag} {rest}") from None
 
 
 def parse(text: str) -> dict[str, tuple[str, ...]]:

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -36,6 +36,7 @@ from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.scenes.tabulation import Progress
 from tdanet_jax.scenes.target_distances import with_targets
 from tdanet_jax.splits import Split, make_split
+from tdanet_jax.targets import naming
 from tdanet_jax.words import WordVectors
 
 
@@ -238,6 +239,8 @@ def make_task(
     if unnamed := _without_words(tables, split, vectors):
         tables = zero_shot.hide_classes(tables, unnamed)
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
+    extra_tables, extra = _extra_targets(config, Rooms(tables, extras), split)
+    train_rooms = zero_shot.hide_classes(extra_tables.subset(split.train_scenes), split.hidden)
     adjacency = None if extras is None else extras.class_graph(tables.classes)
     if adjacency is None:
         adjacency = class_graph.co_occurrence(seen_rooms)
@@ -245,21 +248,31 @@ def make_task(
     model = make_model(config, classes)
     words = vectors.table(tables.classes, config.network.word_norm, blank=True)
     train_words = zero_shot.hide_words(words, tables.classes, split.hidden)
-    parents = _parents(seen_rooms, split, extras)
+    parents = _parents(seen_rooms, split.seen, split.hidden, extras)
+    asked = {room: (*names, *extra.get(room, ())) for room, names in split.seen.items()}
+    train_parents = _parents(train_rooms, asked, split.hidden, extras)
     trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]
     if varied is not None:
         if features is not None and model.encoder.maps:
             flag = "--variants" if config.variants else "--generated"
             raise ValueError(f"{flag}: there are no feature maps of these rooms")
-        varied = with_targets(varied, tables.targets)
+        varied = with_targets(varied, train_rooms.targets)
     train_maps, eval_maps = _feature_maps(config.model, model, features, trains, tables.grid)
     hidden = frozenset((*split.hidden, *unnamed))
     trained = _TrainingRooms(
-        config, seen_rooms, split, hidden, model.spec, parents, train_words, train_maps
+        config,
+        train_rooms,
+        split,
+        extra,
+        hidden,
+        model.spec,
+        train_parents,
+        train_words,
+        train_maps,
     )
 
     def further(load: Callable[[Progress], SceneTables]) -> Callable[[Progress], EnvParams]:
-        return lambda progress: trained.params(with_targets(load(progress), tables.targets))
+        return lambda progress: trained.params(with_targets(load(progress), train_rooms.targets))
 
     return Task(
         tables=tables,
@@ -292,6 +305,7 @@ class _TrainingRooms:
     config: TrainConfig
     rooms: SceneTables  # without hidden classes
     split: Split
+    extra: Mapping[str, Sequence[str]]  # room type -> the configuration's extra targets
     hidden: frozenset[str]  # classes to hide in added rooms
     spec: ObservationSpec
     parents: Parents
@@ -317,6 +331,7 @@ class _TrainingRooms:
             similarity=similarity,
             features=self.maps,
             size_noise=config.size_noise,
+            extra=self.extra,
         )
         return with_noise(params, rooms, sense_noise.parse(config.noise), self.words)
 
@@ -372,11 +387,31 @@ def _feature_maps(
     return train, all_positions
 
 
-def _parents(seen_rooms: SceneTables, split: Split, extras: Extras | None) -> Parents:
+def _extra_targets(
+    config: TrainConfig, rooms: Rooms, split: Split
+) -> tuple[SceneTables, dict[str, tuple[str, ...]]]:
+    """The rooms with the distances to the extra targets as well, and these by room type: without
+    hidden classes and those that are targets anyway."""
+    if config.extra_targets is None:
+        return rooms.tables, {}
+    with naming("--extra-targets"):
+        tables, found = find_targets(config.extra_targets, rooms, config.validation)
+    return tables, {
+        room: tuple(c for c in names if c not in (*split.hidden, *split.seen.get(room, ())))
+        for room, names in found.items()
+    }
+
+
+def _parents(
+    seen_rooms: SceneTables,
+    targets: Mapping[str, Sequence[str]],
+    hidden: Collection[str],
+    extras: Extras | None,
+) -> Parents:
     """Those that came with the rooms, else those found in the training rooms."""
     if extras is not None and extras.parents:
-        return reward.published_parents(seen_rooms, split.seen, extras.parents, split.hidden)
-    return reward.find_parents(seen_rooms, split.seen)
+        return reward.published_parents(seen_rooms, targets, extras.parents, hidden)
+    return reward.find_parents(seen_rooms, targets)
 
 
 def resolve(config: TrainConfig) -> TrainConfig:

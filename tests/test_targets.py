@@ -29,14 +29,14 @@ from tdanet_jax.vocabulary import ALL_TARGETS
 def test_targets_in_words(text: str, parsed: dict[str, tuple[str, ...]], canonical: str) -> None:
     assert targets.parse(text) == parsed
     assert targets.canonical(text) == targets.canonical(canonical) == canonical
-    config = TrainConfig(targets=text, data="rooms.npz").normalised()
-    assert config.targets == canonical
+    config = TrainConfig(targets=text, extra_targets=text, data="rooms.npz").normalised()
+    assert config.targets == config.extra_targets == canonical
     assert configs.from_json(configs.to_json(config)) == config
 
 
 def test_a_run_of_before_there_were_targets_looks_for_the_papers() -> None:
     values = configs.to_json(TrainConfig())
-    del values["targets"]
+    del values["targets"], values["extra_targets"]
     assert configs.from_json(values) == TrainConfig()
     assert targets.known_classes("paper", None) == ALL_TARGETS
 
@@ -53,6 +53,8 @@ def test_a_run_of_before_there_were_targets_looks_for_the_papers() -> None:
         ({"targets": "Mug;Book"}, "the list for every room type is given twice"),
         ({"targets": "my\\mug"}, "--targets my\\mug: 'my\\\\mug' is not the name of a class"),
         ({"targets": "Ketle"}, "--targets Ketle: no class of these rooms; did you mean Kettle?"),
+        ({"extra_targets": "Ketle"}, "--extra-targets Ketle: no class of these rooms; did you"),
+        ({"extra_targets": "Mug,,"}, "--extra-targets Mug,,: a name is missing"),
         ({"targets": "Kettle,Mug", "split": "Vase"}, "--split Vase: choose one of 22/0,"),
         ({"targets": "all", "split": "Ketle"}, "--split Ketle: no target is called Ketle; did you "
                                                "mean Kettle?"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +18,7 @@ from tdanet_jax.models.factory import make_model, unused_flags
 from tdanet_jax.registry import MODELS
 from tdanet_jax.scenes.offline.features import features_path
 from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.splits import make_split
 from tdanet_jax.task import make_task, resolve
 from tdanet_jax.words import WordVectors
 
@@ -114,6 +116,40 @@ def test_a_target_without_a_word_vector_is_refused(ithor: SceneTables, glove: Wo
     odd = renamed(rooms(ithor), Faucet="zzqx")
     with pytest.raises(ValueError, match=r"^no word vectors for the targets zzqx \(zzqx\): give a"):
         make_task(TrainConfig(network=SMALL, targets="zzqx,Sink"), odd, glove)
+
+
+def test_extra_targets_are_for_training_alone_and_half_of_it(
+    some_rooms: SceneTables, glove: WordVectors
+) -> None:
+    tables = some_rooms
+    varied = tables.subset(["FloorPlan7"])
+    varied = dataclasses.replace(varied, scenes=("FloorPlan7-v01",))
+    split, classes = make_split("18/4"), np.array(tables.classes)
+    plain, more = (
+        make_task(TrainConfig(network=SMALL, extra_targets=extra), tables, glove, varied=varied)
+        for extra in (None, "all")
+    )
+    chex.assert_trees_all_equal(plain.eval_params, more.eval_params)
+    assert plain.tables.data_version == more.tables.data_version
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    params = more.train_params
+    state = jax.vmap(dynamics.reset_state, (0, None))(keys, params)
+    asked = classes[np.asarray(params.target_class)[np.asarray(state.target)]]
+    position = np.asarray(state.pose) // params.grid.views
+    room = np.array(tables.room_types)[np.asarray(params.position_room)[position]]
+    assert not {*asked} & split.hidden
+    assert (np.asarray(params.distance)[state.pose, state.target] >= 0).all()
+    for kind, names in split.seen.items():
+        here = asked[room == kind]
+        own = np.isin(here, names)
+        assert 0.4 < own.mean() < 0.6
+        assert len({*here[~own]}) > 20
+        assert {*here[own]} <= {*names}
+    # Extra targets have parents, too, as far as the rooms tell.
+    assert params.parent_class.shape == (len(params.target_class), 3)
+    assert (np.asarray(params.parent_class)[len(tables.targets) :] >= 0).any()
+    with pytest.raises(ValueError, match="--extra-targets Boots: can be found in no training room"):
+        make_task(TrainConfig(network=SMALL, extra_targets="kitchen: Boots"), tables, glove)
 
 
 def test_models_without_an_image_are_shown_none(ithor: SceneTables, glove: WordVectors) -> None:

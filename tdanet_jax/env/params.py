@@ -48,6 +48,7 @@ def make_params(
     features: FeatureMaps | None = None,
     scenes: Sequence[str] | None = None,
     size_noise: float = 0.0,
+    extra: Mapping[str, Sequence[str]] | None = None,
 ) -> EnvParams:
     """The environment's parameters for some rooms and targets.
 
@@ -62,6 +63,8 @@ def make_params(
       features: ResNet-18's maps, if the spec shows them.
       scenes: the rooms in which `reset` begins an episode; by default all.
       size_noise: the sides of a target's boxes are scaled by a factor from e^-x to e^x per episode.
+      extra: room type -> further target classes; in a room with `targets`, about half of the
+        episodes ask for one of these.
 
     Raises:
       ValueError: no episode is possible.
@@ -69,7 +72,8 @@ def make_params(
     start, classes, boxes, _ = _detections(tables, spec.rows == "class")
     longest = max(int(np.diff(start).max(initial=0)), 1)
     pad = (0, longest)  # rows after the last pose, so that a window of K never leaves the table
-    pool = _episode_pool(tables, targets, tables.scenes if scenes is None else scenes)
+    begin = tables.scenes if scenes is None else scenes
+    pool = _episode_pool(tables, (targets, extra or {}), begin)
     return EnvParams(
         next_position=jnp.asarray(tables.next_position, jnp.int32),
         position_room=jnp.asarray(tables.position_room_type, jnp.int8),
@@ -141,12 +145,13 @@ def _detections(
 
 
 def _episode_pool(
-    tables: SceneTables, targets: Mapping[str, Sequence[str]], scenes: Sequence[str]
+    tables: SceneTables, targets: Sequence[Mapping[str, Sequence[str]]], scenes: Sequence[str]
 ) -> dict[str, np.ndarray]:
     """Nested lists, as flat arrays: room type -> `scenes` -> targets -> start positions.
 
     An episode is valid if its target is visible from a state that its start can reach; rooms and
-    pairs without a valid episode are left out.
+    pairs without a valid episode are left out. Each group of `targets` that a room has is asked for
+    about equally often: the pairs of smaller ones are there several times.
     """
     reachable = tables.reachable
     chosen = np.isin(np.array(tables.scenes), scenes)
@@ -161,14 +166,22 @@ def _episode_pool(
         for scene in np.flatnonzero(chosen).tolist():
             first_pair = len(pair_target)
             positions = tables.positions_in(scene, room)
-            for name in targets.get(room_name, ()):
-                goal = tables.targets.index(name)
-                valid = positions[reachable[positions, goal]]
-                if valid.size:
+            groups: list[list[tuple[int, tuple[int, int]]]] = []
+            for group in targets:
+                pairs = []
+                for name in group.get(room_name, ()):
+                    goal = tables.targets.index(name)
+                    valid = positions[reachable[positions, goal]]
+                    if valid.size:
+                        pairs.append((goal, (total, valid.size)))
+                        starts.append(valid)
+                        total += valid.size
+                groups.append(pairs)
+            most = max(map(len, groups))
+            for pairs in filter(None, groups):
+                for goal, span in pairs * round(most / len(pairs)):
                     pair_target.append(goal)
-                    pair_starts.append((total, valid.size))
-                    starts.append(valid)
-                    total += valid.size
+                    pair_starts.append(span)
             if len(pair_target) > first_pair:
                 scene_pairs.append((first_pair, len(pair_target) - first_pair))
         room_scenes[room] = first_scene, len(scene_pairs) - first_scene

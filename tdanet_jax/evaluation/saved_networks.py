@@ -28,6 +28,7 @@ from tdanet_jax.models import classes
 from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
 from tdanet_jax.scenes.dataset import Rooms, find_targets, load_rooms
 from tdanet_jax.splits import make_split
+from tdanet_jax.targets import naming
 from tdanet_jax.task import Task, task_in
 from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import Checkpoints, is_shared, newest
@@ -171,7 +172,7 @@ def evaluate(
     for members in groups.values():
         located, test = members[0].located, members[0].test
         rooms = load_rooms(located.data)
-        with test.naming_flags():
+        with naming("--targets" if test.test_targets is None else "--test-targets"):
             task = task_in(rooms, located)
         own = {network.config.sought: network.config for network in members}
         versions = {sought: _version(task, rooms, config, test) for sought, config in own.items()}

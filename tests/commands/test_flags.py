@@ -600,6 +600,7 @@ SHOWN = {
     "steps": "training/test_run.py::test_the_budget_in_steps_is_kept_and_every_chunk_has_a_row",
     "episodes": "training/test_run.py::test_the_budget_in_episodes_ends_the_run",
     "targets": "test_targets.py::test_any_target_can_be_unseen",
+    "extra_targets": "test_task.py::test_extra_targets_are_for_training_alone_and_half_of_it",
     "variants": "scenes/test_variants.py::test_a_run_trains_in_variants_and_is_evaluated_as_ever",
     "generated": "scenes/test_generated.py::test_a_run_trains_in_generated_rooms_and_is_evaluated_"
     "as_ever",

@@ -217,6 +217,20 @@ def test_perturbing_hidden_data_changes_nothing_with_any_targets(
     check_perturbed(config, hidden, rooms, glove)
 
 
+@pytest.mark.parametrize(
+    ("extra", "split"),
+    [
+        ("all", "18/4"),
+        pytest.param("kitchen: all; bedroom: Book, Pillow", "Pillow", marks=pytest.mark.slow),
+    ],
+)
+def test_perturbing_hidden_data_changes_nothing_with_extra_targets(
+    rooms: SceneTables, glove: WordVectors, extra: str, split: str
+) -> None:
+    config = dataclasses.replace(config_of(split, False, "object"), extra_targets=extra)
+    check_perturbed(config, make_split(split).hidden, rooms, glove)
+
+
 def check_perturbed(
     config: TrainConfig, hidden: Collection[str], rooms: SceneTables, glove: WordVectors
 ) -> None:
