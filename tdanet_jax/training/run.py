@@ -76,6 +76,8 @@ class Run:
         """tdanet, split 18/4, seed 0; or tdanet, --odometry, ..."""
         name = self.task.spec.agent_name(self.config.model)
         asked = "" if self.config.targets == PAPER else f", targets {self.config.targets}"
+        if self.config.extra_targets is not None:
+            asked += f", extra targets {self.config.extra_targets}"
         return f"{name}, split {self.task.split.name}{asked}, seed {self.config.seed}"
 
     def _init(self, key: jax.Array, words: jax.Array, params: EnvParams) -> TrainState:
