@@ -338,7 +338,13 @@ def test_wrong_arguments_give_one_line_and_write_nothing(
     assert sorted(folder.rglob("*")) == folders
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in ("train_zero_shot", "scenes") else pytest.mark.slow)
+        for name in CASES
+    ],
+)
 def test_in_a_process_of_its_own(name: str) -> None:
     """The same, once for each command, with nothing of the test's process in the way."""
     arguments, message = CASES[name][0]

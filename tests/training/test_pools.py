@@ -187,7 +187,9 @@ def test_nothing_hidden_is_in_further_pools(ithor: SceneTables) -> None:
     assert np.isin(rooms.row_class, hidden).any()
 
 
-@pytest.mark.parametrize("error", [SceneError("no room"), MemoryError("no memory")])
+@pytest.mark.parametrize(
+    "error", [SceneError("no room"), pytest.param(MemoryError("no memory"), marks=pytest.mark.slow)]
+)
 def test_a_pool_that_cannot_be_built_loses_nothing(
     task: Task, tmp_path: Path, error: Exception
 ) -> None:
