@@ -130,7 +130,11 @@ def data_curve(
                 marker = MARKERS[index % len(MARKERS)]
                 axis.plot(*zip(*runs, strict=True), marker, color=color, label=kind)
             axis.set(xscale="log", ylabel=f"{group} targets, {measure}, per cent")
-            ticks = sorted({count for _, count, _ in own})
+            ticks: list[int] = []
+            for count in sorted({count for _, count, _ in own}):
+                if not ticks or count > 1.2 * ticks[-1]:  # labels would overlap
+                    ticks.append(count)
+            axis.margins(0.08)
             axis.set_xticks(ticks, [f"{count:,}" for count in ticks], minor=False, rotation=45)
             axis.set_xticks([], minor=True)
             axis.grid(alpha=0.3)
