@@ -183,6 +183,13 @@ def _results(
     }
 
 
+def _shares(records: Records) -> dict[str, float]:
+    """The share of each action among all that were taken, in percent."""
+    count = np.bincount(records.actions[records.actions >= 0], minlength=len(ACTION_NAMES))
+    shares = 100 * count / max(count.sum(), 1)
+    return {name: round(float(x), 2) for name, x in zip(ACTION_NAMES, shares, strict=True)}
+
+
 def _summary(column: Columns) -> dict[str, dict[str, Any]]:
     return summarise(*(column[name] for name in COLUMNS))
 
@@ -239,6 +246,7 @@ def results(
     by_class = is_open(provenance.split)
     groups = {name: columns(tables, *pair, by_class) for name, pair in played.items()}
     out = _results(provenance, groups, tables)
+    out["actions"] = {name: _shares(records) for name, (_, records) in played.items()}
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         write_rows(folder, all_rows(tables, played))
@@ -313,6 +321,9 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
     for group, column in groups.items():
         share = 100 * float((column["shortest"] == 1).mean())
         lines.append(f"Target in view at the start (L = 1), {group}: {share:.1f} % of episodes.")
+    for group, shares in out.get("actions", {}).items():
+        parts = (f"{name} {share:.1f} %" for name, share in shares.items())
+        lines.append(f"Actions taken, {group}: {', '.join(parts)}.")
     for title, key in (("Room", "by_room"), ("Target", "by_target")):
         lines += ["", f"## By {title.lower()}", "", *_header(title, "Group")]
         for name, parts in out[key].items():

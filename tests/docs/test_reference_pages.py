@@ -53,7 +53,7 @@ def named(part: str) -> set[str]:
 
 def test_fields_of_the_results() -> None:
     told = named(section("evaluation", "Fields of `results.json`")) - {"Field"}
-    groups = {"seen", "unseen", "by_room", "by_target"}
+    groups = {"seen", "unseen", "by_room", "by_target", "actions"}
     fields = {field.name for field in dataclasses.fields(Provenance)}
     assert told == {*fields, *groups, *FLAGS, "version", "commit"}
 

@@ -17,6 +17,7 @@ TOP = [
     "version", "split", "model", "policy", "episodes_trained", "seen", "unseen", "by_room",
     "by_target", "seed", "evaluation_seed", "steps", "data_version", "data", "image", "sensors",
     "departures", "targets", "trained_targets", "odometry", "triangulation", "commit",
+    "actions",
 ]  # fmt: skip
 
 
@@ -72,6 +73,14 @@ def test_results_have_the_documented_shape(written):
     assert set(out["seen"]["L>=1"]) == BUCKET
     assert out["by_room"] == {"kitchen": {"seen": out["seen"]}}
     assert out["by_target"] == {"Mug": {"seen": out["seen"]}}
+    assert out["actions"] == {
+        "seen": {
+            "MoveAhead": 33.33, "RotateLeft": 16.67, "RotateRight": 8.33, "LookUp": 8.33,
+            "LookDown": 8.33, "Done": 25.0,
+        },
+    }  # fmt: skip
+    page = (folder / "results.md").read_text()
+    assert "Actions taken, seen: MoveAhead 33.3 %, RotateLeft 16.7 %, RotateRight 8.3 %," in page
 
 
 def test_the_report_says_how_it_can_be_made_again(played, ithor, tmp_path):

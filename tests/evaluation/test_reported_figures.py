@@ -20,6 +20,7 @@ from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.evaluation.paper import WORLDS_DIFFER, Rate
 from tdanet_jax.evaluation.rollout import Records
 from tdanet_jax.scenes import SceneTables
+from tdanet_jax.vocabulary import ACTION_NAMES
 from tests.support.handmade import Room, corridor, state, tables_of
 
 Rows = Sequence[Mapping[str, Any]]
@@ -148,6 +149,12 @@ def test_results_are_those_of_loops_over_the_records(written: Path, rows: Rows) 
         for name, group in found:
             expected = figures(chosen(rows, group=group, **{field: name}))
             assert out[key][name][group] == expected
+    for group in EPISODES:
+        taken = [action for row in chosen(rows, group=group) for action in row["actions"]]
+        assert out["actions"][group] == {
+            name: pytest.approx(100 * taken.count(name) / len(taken), abs=0.006)
+            for name in ACTION_NAMES
+        }
     origin = {
         "split": "18/4", "model": "tdanet", "policy": "sample", "episodes_trained": 1234, "seed": 3,
         "evaluation_seed": 7, "steps": 56789, "data_version": "d4t4", "data": None,
@@ -211,6 +218,9 @@ def test_the_page_of_results_line_by_line(written: Path, rows: Rows) -> None:
         # ones, one has L = 1.
         "Target in view at the start (L = 1), seen: 23.1 % of episodes.",
         "Target in view at the start (L = 1), unseen: 14.3 % of episodes.",
+        *(f"Actions taken, {group}: "
+          + ", ".join(f"{name} {share:.1f} %" for name, share in out["actions"][group].items())
+          + "." for group in EPISODES),
         "## By room",
         f"| Room | Group | {HEADS}",
         rule,

@@ -107,16 +107,16 @@ def test_a_run_is_tested_on_the_targets_of_another(
     for name, targets in {"paper": "paper", "others": "Mug,Kettle"}.items():
         config = dataclasses.replace(TINY, data=str(rooms_file), targets=targets)
         save_untrained(config, tmp_path / name, some_rooms, glove)
-        for test in (None, "paper", "mug, kettle"):
+        other = {"paper": "mug, kettle", "others": "paper"}[name]
+        for test in (None, other):
             done = tdanet_jax.evaluate(tmp_path / name, test=EvalConfig(test_targets=test))
             found[name, test] = {
                 key: done[key] for key in (*GROUPS, "by_target", "targets", "data_version")
             }
             assert done["departures"] is None
-            other = {"paper": "mug, kettle", "others": "paper"}[name]
             assert done["trained_targets"] == (config.targets if test == other else None)
-    assert found["paper", None] == found["paper", "paper"] == found["others", "paper"]
-    assert found["others", None] == found["others", "mug, kettle"] == found["paper", "mug, kettle"]
+    assert found["paper", None] == found["others", "paper"]
+    assert found["others", None] == found["paper", "mug, kettle"]
     assert {*found["paper", "mug, kettle"]["by_target"]} == {"Kettle", "Mug"}
     assert found["paper", "mug, kettle"]["targets"] == "Mug,Kettle"
 
