@@ -239,8 +239,6 @@ def make_task(
     if unnamed := _without_words(tables, split, vectors):
         tables = zero_shot.hide_classes(tables, unnamed)
     seen_rooms = zero_shot.hide_classes(tables.subset(split.train_scenes), split.hidden)
-    extra_tables, extra = _extra_targets(config, Rooms(tables, extras), split)
-    train_rooms = zero_shot.hide_classes(extra_tables.subset(split.train_scenes), split.hidden)
     adjacency = None if extras is None else extras.class_graph(tables.classes)
     if adjacency is None:
         adjacency = class_graph.co_occurrence(seen_rooms)
@@ -249,8 +247,15 @@ def make_task(
     words = vectors.table(tables.classes, config.network.word_norm, blank=True)
     train_words = zero_shot.hide_words(words, tables.classes, split.hidden)
     parents = _parents(seen_rooms, split.seen, split.hidden, extras)
-    asked = {room: (*names, *extra.get(room, ())) for room, names in split.seen.items()}
-    train_parents = _parents(train_rooms, asked, split.hidden, extras)
+    train_rooms, train_parents, extra = seen_rooms, parents, dict[str, tuple[str, ...]]()
+    if config.extra_targets is not None:
+        further_tables, extra = _extra_targets(
+            config.extra_targets, Rooms(tables, extras), config.validation, split
+        )
+        train_rooms = further_tables.subset(split.train_scenes)
+        train_rooms = zero_shot.hide_classes(train_rooms, split.hidden)
+        asked = {room: (*names, *extra.get(room, ())) for room, names in split.seen.items()}
+        train_parents = _parents(train_rooms, asked, split.hidden, extras)
     trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]
     if varied is not None:
         if features is not None and model.encoder.maps:
@@ -388,14 +393,12 @@ def _feature_maps(
 
 
 def _extra_targets(
-    config: TrainConfig, rooms: Rooms, split: Split
+    asked: str, rooms: Rooms, validation: bool, split: Split
 ) -> tuple[SceneTables, dict[str, tuple[str, ...]]]:
     """The rooms with the distances to the extra targets as well, and these by room type: without
     hidden classes and those that are targets anyway."""
-    if config.extra_targets is None:
-        return rooms.tables, {}
     with naming("--extra-targets"):
-        tables, found = find_targets(config.extra_targets, rooms, config.validation)
+        tables, found = find_targets(asked, rooms, validation)
     return tables, {
         room: tuple(c for c in names if c not in (*split.hidden, *split.seen.get(room, ())))
         for room, names in found.items()

@@ -269,7 +269,7 @@ def all_rows(tables: SceneTables, played: Played) -> Iterator[dict[str, Any]]:
         yield from episode_rows(name, columns(tables, episodes, records), records)
 
 
-def trained_for(out: Mapping[str, Any]) -> list[str]:
+def _trained_for(out: Mapping[str, Any]) -> list[str]:
     """A sentence on an agent that was trained for other targets than those of its test."""
     if out.get("trained_targets") is None:
         return []
@@ -290,7 +290,7 @@ def markdown(out: Mapping[str, Any], groups: Mapping[str, Columns]) -> str:
         f"{out['data_version']}, code {out['commit']}.",
         *(["", f"**{in_markdown(describe_departures(departures))}.**", ""] if departures else []),
         *([f"Targets: {in_markdown(out['targets'])}."] if out["targets"] != PAPER else []),
-        *trained_for(out),
+        *_trained_for(out),
         *(f"{n.capitalize()}: {in_markdown(out[n])}." for n in ("data", "image") if out[n]),
         "",
         "SR and SPL in percent, with 95 % bootstrap intervals over "
