@@ -27,6 +27,7 @@ from tdanet_jax.models import actor_critic, reach
 from tdanet_jax.models.activation_cache import ACTIVATIONS
 from tdanet_jax.models.actor_critic import ActorCritic, RecurrentState
 from tdanet_jax.training.gae import advantages
+from tdanet_jax.vocabulary import NUM_ACTIONS
 
 #: Kernels with more weights than this are cast to the network's precision once per rollout.
 SMALL = 2**16
@@ -379,9 +380,10 @@ def _explained_variance(steps: Rollout, advantage: jax.Array) -> jax.Array:
 
 
 def _episode_sums(steps: Rollout) -> dict[str, jax.Array]:
-    """Sums over the episodes that finished in a rollout."""
+    """Sums over a rollout, and over the episodes that finished in it."""
     success = (steps.success & steps.done).astype(jnp.float32)
     length = jnp.maximum(steps.length, 1)
+    taken = steps.action[..., None] == jnp.arange(NUM_ACTIONS)
     efficiency = success * steps.shortest / jnp.maximum(steps.shortest, length)
     return {
         "episodes": steps.done.sum(),
@@ -389,6 +391,7 @@ def _episode_sums(steps: Rollout) -> dict[str, jax.Array]:
         "spl_sum": jnp.where(steps.done, efficiency, 0.0).sum(),
         "length_sum": jnp.where(steps.done, steps.length, 0).sum(),
         "reward_sum": steps.reward.sum(),
+        "actions": jnp.sum(taken & ~steps.bootstrap_only[..., None], axis=(0, 1)),
         "bootstrap_only_steps": steps.bootstrap_only.sum(),
     }
 

@@ -21,6 +21,7 @@ from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.training.journal import METRICS_FILE, Journal, Row
 from tdanet_jax.training.learner import TrainState
 from tdanet_jax.training.pools import Pools
+from tdanet_jax.vocabulary import ACTION_NAMES
 
 
 class Run:
@@ -266,11 +267,14 @@ class Run:
         return chunk.lower(self.state, self._shares(), self._words, self.pools.params).compile()
 
     def _row(self, metrics: dict[str, np.ndarray], took: float) -> Row:
-        """One line of `metrics.jsonl`: means over the chunk's episodes, updates and steps.
+        """One line of `metrics.jsonl`: means over the chunk's episodes, updates and steps, and the
+        share of each action.
 
         A mean is None if no episode ended, or no value was finite.
         """
         steps = self.config.chunk_updates * self.config.steps_per_update
+        taken = metrics["actions"].sum(axis=0)
+        shares = taken / max(taken.sum(), 1)
         episodes = int(metrics["episodes"].sum())
 
         def per_episode(name: str) -> float | None:
@@ -290,6 +294,7 @@ class Run:
             "reward": float(metrics["reward_sum"].sum()) / steps,
             **{name: over_updates(name) for name in _UPDATE_MEANS},
             **{name: over_updates(name) for name in _ESTIMATE_MEANS if name in metrics},
+            **{f"actions/{name}": float(n) for name, n in zip(ACTION_NAMES, shares, strict=True)},
             "bootstrap_only_steps": int(metrics["bootstrap_only_steps"].sum()),
             "skipped": int(self.state.skipped),
             "seconds": round(self.seconds, 3),

@@ -530,6 +530,8 @@ def test_metrics_are_sums_over_the_episodes_that_finished() -> None:
     assert 100 * float(metrics["spl_sum"]) / len(won) == pytest.approx(spl, rel=1e-5)
     assert int(metrics["length_sum"]) == sum(taken)
     assert int(metrics["bootstrap_only_steps"]) == int(steps.bootstrap_only.sum()) > 0
+    acted = np.asarray(steps.action)[~np.asarray(steps.bootstrap_only)]
+    np.testing.assert_array_equal(metrics["actions"], np.bincount(acted, minlength=6))
     assert float(metrics["reward_sum"]) == pytest.approx(float(steps.reward.sum()), rel=1e-5)
     assert int(update(after, jnp.float32(0), CONFIG, MODEL, WORDS, PARAMS)[0].episodes) > len(won)
 

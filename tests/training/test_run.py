@@ -205,7 +205,8 @@ def test_a_run_that_is_no_longer_finite_stops_with_its_state_saved(task, tmp_pat
 
 
 def test_a_chunk_in_which_no_episode_ended_has_no_success(whole, tmp_path):
-    row = whole[1]._row(collections.defaultdict(lambda: np.zeros(2)), took=1.0)
+    metrics = collections.defaultdict(lambda: np.zeros(2)) | {"actions": np.zeros((2, 6), int)}
+    row = whole[1]._row(metrics, took=1.0)
     assert (row["success"], row["spl"], row["length"]) == (None, None, None)
     assert row.keys() == whole[2][-1].keys()
     Journal(tmp_path / METRICS_FILE, 0).write(row)

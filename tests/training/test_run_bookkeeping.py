@@ -102,8 +102,11 @@ def test_time_and_rows_continue(task: Task, tmp_path: Path) -> None:
     metrics = {name: np.ones(1) for name in (*_UPDATE_MEANS, "bootstrap_only_steps", "reward_sum")}
     metrics |= {name: np.full(1, 2.0) for name in ("success_sum", "spl_sum", "length_sum")}
     metrics["episodes"] = np.array([4])
+    metrics["actions"] = np.array([[6, 3, 1, 2, 0, 4]])
     row = again._record(again.state, metrics, again.progress, took=239.0)
     assert row["seconds"] == 599.25
+    shares = [row[f"actions/{name}"] for name in ACTION_NAMES]
+    assert shares == [0.375, 0.1875, 0.0625, 0.125, 0.0, 0.25]
     assert read_metrics(tmp_path) == [row]
     assert again.progress < 1.0
     again._record(again.state, metrics, again.progress, took=0.75)
