@@ -71,6 +71,10 @@ class LearnerConfig:
     """Weight of the entropy at the end of the budget; changes linearly."""
     value_weight: float = 0.5
     """Weight of the value loss, the squared error."""
+    imitation_weight: float = 0.0
+    """Initial weight of imitation, the mean of minus the logarithm of the probability (among all
+    actions but Done) of those that lead nearer to a target that has been seen. Falls linearly to 0
+    at half of the budget. Not in the paper (docs/method.md)."""
     step_limit: int = 50
     """Actions after which a training episode is truncated."""
     partial_reward: Literal["parents", "similarity", "none"] = "parents"
@@ -371,7 +375,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     (
         (
             "history", "variants", "generated", "final_learning_rate", "entropy_weight",
-            "final_entropy_weight", "value_weight",
+            "final_entropy_weight", "value_weight", "imitation_weight",
         ),
         lambda value: value >= 0,
         "not be negative",

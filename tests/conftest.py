@@ -156,6 +156,7 @@ def save_untrained(
         weights = samples.parameters(task.model, task.words)
         weights["actor"]["bias"] = weights["actor"]["bias"].at[Action.DONE].set(-1.0)
     rest = {f.name: jnp.int32(counts.get(f.name, 0)) for f in dataclasses.fields(TrainState)}
-    state = TrainState(**rest | {"params": weights, "key": jax.random.key(0)})
+    own = {"params": weights, "key": jax.random.key(0), "target_seen": None}
+    state = TrainState(**rest | own)
     Checkpoints(folder).save(state, {"seconds": 0.0, "data_version": task.tables.data_version})
     return task, weights

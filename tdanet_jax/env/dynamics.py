@@ -196,6 +196,17 @@ def move(pose: jax.Array, action: jax.Array, params: EnvParams) -> jax.Array:
     return params.grid.join(position, *odometry.turn(params.grid, rotation, horizon, action))
 
 
+def best_actions(state: EnvState, params: EnvParams) -> jax.Array:
+    """The actions [6] bool that begin a shortest path to the target.
+
+    `Done` alone where the target is visible; none where it cannot be reached.
+    """
+    actions = jnp.arange(NUM_ACTIONS)
+    here = params.distance[state.pose, state.target]
+    there = params.distance[move(state.pose, actions, params), state.target]
+    return jnp.where(actions == Action.DONE, here == 0, (there == here - 1) & (here > 0))
+
+
 def transition(state: EnvState, action: jax.Array, params: EnvParams) -> Outcome:
     """One action, without any reset. The reward is one of four values, as in the paper's Eq. 3.
 

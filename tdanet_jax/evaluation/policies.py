@@ -47,17 +47,12 @@ def random() -> Policy:
 
 def shortest_path() -> Policy:
     """Descends the table of distances and says Done as soon as the target is visible."""
-    move = jax.vmap(jax.vmap(dynamics.move, (None, 0, None)), (0, None, None))
+    best_actions = jax.vmap(dynamics.best_actions, (0, None))
 
     def act(
         weights: Any, memory: Any, key: jax.Array, state: EnvState, params: EnvParams
     ) -> tuple[Any, jax.Array]:
-        poses = move(state.pose, jnp.arange(NUM_ACTIONS), params)  # [B, 6]
-        distance = params.distance[poses, state.target[:, None]].astype(jnp.int32)
-        far = jnp.iinfo(jnp.int32).max
-        distance = jnp.where(distance < 0, far, distance).at[:, Action.DONE].set(far)
-        here = params.distance[state.pose, state.target]
-        return memory, jnp.where(here == 0, Action.DONE, jnp.argmin(distance, axis=-1))
+        return memory, jnp.argmax(best_actions(state, params), axis=-1)
 
     return Policy(lambda weights, batch: (), act)
 

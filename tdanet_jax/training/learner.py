@@ -26,6 +26,7 @@ from tdanet_jax.env.types import EnvParams, EnvState, Observation
 from tdanet_jax.models import actor_critic, reach
 from tdanet_jax.models.activation_cache import ACTIVATIONS
 from tdanet_jax.models.actor_critic import ActorCritic, RecurrentState
+from tdanet_jax.training import imitation
 from tdanet_jax.training.gae import advantages
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
@@ -37,7 +38,7 @@ class TrainState(struct.PyTreeNode):
     """Everything that a run needs to resume exactly where it was."""
 
     #: Fields whose arrays have a row per environment.
-    PER_ENVIRONMENT: ClassVar = ("env_state", "bootstrap_only", "recurrent")
+    PER_ENVIRONMENT: ClassVar = ("env_state", "bootstrap_only", "recurrent", "target_seen")
 
     params: Any
     opt_state: optax.OptState
@@ -48,6 +49,8 @@ class TrainState(struct.PyTreeNode):
     updates: jax.Array  # int32, updates done
     episodes: jax.Array  # int32, training episodes finished
     skipped: jax.Array  # int32, updates skipped because the loss or gradient was not finite
+    #: [B] bool, the target has been seen earlier in the episode; if shortest paths are imitated.
+    target_seen: jax.Array | None = None
 
 
 class Rollout(NamedTuple):
@@ -69,6 +72,28 @@ class Rollout(NamedTuple):
     length: jax.Array
     shortest: jax.Array
     within_reach: jax.Array | None  # the target was, before the action; if the network estimates it
+    best_moves: jax.Array | None  # [..., 6], what `imitation` teaches in this state, if anything
+
+
+class Scheduled(NamedTuple):
+    """What depends on how much of the budget is spent."""
+
+    learning_rate: jax.Array
+    entropy_weight: jax.Array
+    imitation_weight: jax.Array
+
+
+def schedule(config: LearnerConfig, progress: jax.Array) -> Scheduled:
+    """The values after a share of the budget, 0 to 1; later ones are those of its end."""
+
+    def mix(start: float, end: float) -> jax.Array:
+        return start + (end - start) * jnp.clip(progress, 0.0, 1.0)
+
+    return Scheduled(
+        learning_rate=mix(config.learning_rate, config.final_learning_rate),
+        entropy_weight=mix(config.entropy_weight, config.final_entropy_weight),
+        imitation_weight=imitation.weight(config.imitation_weight, progress),
+    )
 
 
 class Experience(NamedTuple):
@@ -113,7 +138,13 @@ def init(
         updates=jnp.zeros((), jnp.int32),
         episodes=jnp.zeros((), jnp.int32),
         skipped=jnp.zeros((), jnp.int32),
+        target_seen=_unseen(config),
     )
+
+
+def _unseen(config: LearnerConfig) -> jax.Array | None:
+    """`TrainState.target_seen` where episodes begin."""
+    return jnp.zeros(config.num_envs, bool) if config.imitation_weight else None
 
 
 def begin_again(
@@ -127,6 +158,7 @@ def begin_again(
         env_state=_reset(key, params, batch),
         bootstrap_only=jnp.zeros(batch, bool),
         recurrent=actor_critic.initial_state(model, state.params, batch, training=True),
+        target_seen=_unseen(config),
     )
 
 
@@ -152,6 +184,7 @@ def rollout(
     observe = scope(jax.vmap(dynamics.observe, (0, None)))
     transition = scope(jax.vmap(dynamics.transition, (0, 0, None)))
     within_reach = scope(jax.vmap(lambda state: dynamics.would_succeed(state, params)))
+    best_actions = scope(jax.vmap(lambda state: dynamics.best_actions(state, params)))
     # Cast once per rollout what every step would cast: the kernels of the large products.
     weights = jax.tree.map(
         lambda x: x.astype(model.dtype) if x.ndim > 1 and x.size > SMALL else x, state.params
@@ -177,6 +210,10 @@ def rollout(
         valued_next = truncated if config.bootstrap_truncated else jnp.zeros_like(truncated)
         terminal = only | terminated | (truncated & ~valued_next)
         begun = _reset(reset_key, params, batch)
+        seen = best_moves = None
+        if state.target_seen is not None:
+            seen = state.target_seen | obs.target_in_view
+            best_moves = best_actions(state.env_state) & imitation.MOVES & seen[:, None]
         step = Rollout(
             obs=obs,
             prev_action_probs=state.recurrent.prev_action_probs,
@@ -194,10 +231,12 @@ def rollout(
             length=moved.state.steps,
             shortest=state.env_state.shortest,
             within_reach=within_reach(state.env_state) if estimated else None,
+            best_moves=best_moves,
         )
         following = state.replace(
             env_state=dynamics.choose(terminal, begun, moved.state),
             bootstrap_only=valued_next,
+            target_seen=None if seen is None else seen & ~terminal,
             recurrent=recurrent.replace(prev_action_probs=jnp.exp(log_probs)).restarted(terminal),
         )
         return following, step
@@ -218,7 +257,7 @@ def _dropout_mask(key: jax.Array, rate: float, shape: tuple[int, ...]) -> jax.Ar
 def loss(
     weights: Any,
     experience: Experience,
-    entropy_weight: jax.Array,
+    now: Scheduled,
     config: LearnerConfig,
     model: ActorCritic,
     words: jax.Array,
@@ -249,8 +288,11 @@ def loss(
         gain = jnp.minimum(ratio * advantage, clipped * advantage)
     policy_loss = -mean(gain)
     value_loss = mean(0.5 * (steps.value + advantage - out.value) ** 2)
-    total = policy_loss + config.value_weight * value_loss - entropy_weight * entropy
+    total = policy_loss + config.value_weight * value_loss - now.entropy_weight * entropy
     parts = {"policy_loss": policy_loss, "value_loss": value_loss, "entropy": entropy}
+    if steps.best_moves is not None:
+        parts["imitation_loss"] = mean(imitation.loss(out.logits, steps.best_moves))
+        total += now.imitation_weight * parts["imitation_loss"]
     if out.reach_logit is not None:
         cross_entropy = optax.sigmoid_binary_cross_entropy(out.reach_logit, steps.within_reach)
         parts["reach_loss"] = mean(cross_entropy, counted & steps.obs.target_in_view)
@@ -278,8 +320,7 @@ def learn(
     weights: Any,
     opt_state: optax.OptState,
     experience: Experience,
-    rate: jax.Array,
-    entropy_weight: jax.Array,
+    now: Scheduled,
     config: LearnerConfig,
     model: ActorCritic,
     words: jax.Array,
@@ -290,21 +331,20 @@ def learn(
       weights: the network's parameters.
       opt_state: the optimiser's state.
       experience: what to learn from.
-      rate: the learning rate.
-      entropy_weight: of the loss.
+      now: the learning rate, and weights in the loss.
 
     Returns:
       Parameters and the optimiser's state after it, and means to log. `skipped` is 1 if the loss or
       the gradient was not finite: then nothing has changed.
     """
     (total, parts), grads = jax.value_and_grad(loss, has_aux=True)(
-        weights, experience, entropy_weight, config, model, words
+        weights, experience, now, config, model, words
     )
     with jax.named_scope("optimizer"):
         grad_norm = optax.tree.norm(grads)
         finite = jnp.isfinite(total) & jnp.isfinite(grad_norm)
         scaled, moved = make_optimizer(config).update(grads, opt_state, weights)
-        stepped = jax.tree.map(lambda p, g: p - rate * g, weights, scaled)
+        stepped = jax.tree.map(lambda p, g: p - now.learning_rate * g, weights, scaled)
         weights, opt_state = jax.tree.map(
             lambda new, old: jnp.where(finite, new, old), (stepped, moved), (weights, opt_state)
         )
@@ -335,15 +375,9 @@ def update(
         config.gae_lambda,
     )  # fmt: skip
 
-    def mix(start: float, end: float) -> jax.Array:
-        return start + (end - start) * jnp.clip(progress, 0.0, 1.0)
-
-    rate = mix(config.learning_rate, config.final_learning_rate)
-    entropy_weight = mix(config.entropy_weight, config.final_entropy_weight)
+    now = schedule(config, progress)
     experience = Experience(steps, advantage, state.recurrent.carry)
-    learning = functools.partial(
-        learn, rate=rate, entropy_weight=entropy_weight, config=config, model=model, words=words
-    )
+    learning = functools.partial(learn, now=now, config=config, model=model, words=words)
     if config.optimizer_steps == 1:
         weights, opt_state, metrics = learning(state.params, state.opt_state, experience)
     else:
@@ -367,7 +401,7 @@ def update(
     )
     metrics |= {
         "explained_variance": _explained_variance(steps, advantage),
-        "learning_rate": rate,
+        "learning_rate": now.learning_rate,
     }
     return after, metrics | _episode_sums(steps)
 

@@ -293,7 +293,7 @@ class Run:
             "length": per_episode("length_sum"),
             "reward": float(metrics["reward_sum"].sum()) / steps,
             **{name: over_updates(name) for name in _UPDATE_MEANS},
-            **{name: over_updates(name) for name in _ESTIMATE_MEANS if name in metrics},
+            **{name: over_updates(name) for name in _FURTHER_MEANS if name in metrics},
             **{f"actions/{name}": float(n) for name, n in zip(ACTION_NAMES, shares, strict=True)},
             "bootstrap_only_steps": int(metrics["bootstrap_only_steps"].sum()),
             "skipped": int(self.state.skipped),
@@ -372,5 +372,5 @@ def _chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
 _UPDATE_MEANS = (
     "policy_loss", "value_loss", "entropy", "explained_variance", "grad_norm", "learning_rate",
 )  # fmt: skip
-#: Of networks that estimate reach.
-_ESTIMATE_MEANS = ("reach_loss",)
+#: Of runs that imitate shortest paths, and of networks that estimate reach.
+_FURTHER_MEANS = ("imitation_loss", "reach_loss")

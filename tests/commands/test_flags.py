@@ -608,6 +608,8 @@ SHOWN = {
     "evaluated_as_ever",
     "pool_rooms": "scenes/test_generated.py::test_rooms_that_are_too_many_are_dealt_to_pools",
     "pool_updates": "training/test_pools.py::test_turns_are_whole_chunks_and_one_pool_has_no_turns",
+    "imitation_weight": "training/test_imitation.py::test_its_weight_falls_to_nothing_at_half_"
+    "of_the_budget",
     "minutes": "training/test_run_bookkeeping.py::test_time_and_rows_continue",
     "seed": "training/test_run.py::test_another_seed_gives_another_run",
     "validation": "test_splits.py::test_validation_touches_neither_test_rooms_nor_unseen_classes",

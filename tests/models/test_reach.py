@@ -130,10 +130,11 @@ def test_what_it_is_taught_is_where_done_succeeds() -> None:
 def test_its_loss_is_the_cross_entropy_where_the_target_is_in_view() -> None:
     state, steps, advantage = example()
     experience = learner.Experience(steps, advantage, state.recurrent.carry)
+    now = learner.Scheduled(*map(jnp.float32, (0, 0.01, 0)))
 
     @jax.jit
     def total(params: Any) -> Any:
-        return learner.loss(params, experience, 0.01, house.CONFIG, MODEL, house.WORDS)
+        return learner.loss(params, experience, now, house.CONFIG, MODEL, house.WORDS)
 
     @jax.jit
     @jax.grad

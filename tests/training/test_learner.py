@@ -229,7 +229,8 @@ def gradient(
 
     def total(params: Any) -> Any:
         experience = learner.Experience(steps, advantage, state.recurrent.carry)
-        return learner.loss(params, experience, entropy, CONFIG, model, WORDS)
+        now = learner.Scheduled(jnp.float32(0), entropy, jnp.float32(0))
+        return learner.loss(params, experience, now, CONFIG, model, WORDS)
 
     return jax.value_and_grad(total, has_aux=True)(state.params)
 

@@ -20,6 +20,7 @@ from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.training.journal import read_metrics
 from tdanet_jax.training.learner import TrainState
 from tdanet_jax.training.run import _UPDATE_MEANS, Run
+from tdanet_jax.vocabulary import ACTION_NAMES
 from tdanet_jax.words import WordVectors
 from tdanet_jax.workflows.train import _check_longer as check_longer
 

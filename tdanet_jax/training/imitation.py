@@ -1,0 +1,46 @@
+"""Imitation of shortest paths, for the first half of a run.
+
+Left to its rewards, an agent turns one way only: when it looks for its target, either way will do,
+and by the time that it knows where the target is, it has given up one of them. So training shows it
+which moves lead nearer, from the tables of distances. It does so only once the target has been seen
+in the episode: before, the shortest path depends on what the agent cannot know. It never says when
+to take `Done`: that is learnt from rewards, which weigh success against haste.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from tdanet_jax.vocabulary import NUM_ACTIONS, Action
+
+#: Share of the budget after which nothing is imitated any more.
+END = 0.5
+#: All actions but `Done`, [6] bool.
+MOVES = np.arange(NUM_ACTIONS) != Action.DONE
+
+
+def weight(initial: float, progress: jax.Array) -> jax.Array:
+    """The weight of imitation in the loss: falls linearly from `initial` to 0 at `END`."""
+    return initial * jnp.clip(1.0 - progress / END, 0.0, 1.0)
+
+
+def loss(logits: jax.Array, best_moves: jax.Array) -> jax.Array:
+    """Minus the logarithm of the probability of the best moves among all moves.
+
+    Args:
+      logits: [..., 6], of the actions.
+      best_moves: [..., 6] bool, moves that lead nearer; without any, the loss is 0.
+
+    Returns:
+      [...] float32, in nats.
+    """
+    taught = jnp.any(best_moves, axis=-1, keepdims=True)
+    best = jnp.where(taught, best_moves, MOVES)
+    every = jnp.broadcast_to(MOVES, logits.shape)
+    return _logsumexp(logits, every) - _logsumexp(logits, best)
+
+
+def _logsumexp(logits: jax.Array, where: jax.Array) -> jax.Array:
+    return jax.nn.logsumexp(logits, axis=-1, where=where)
