@@ -72,9 +72,9 @@ class LearnerConfig:
     value_weight: float = 0.5
     """Weight of the value loss, the squared error."""
     imitation_weight: float = 0.0
-    """Initial weight of imitation, the mean of minus the logarithm of the probability (among all
-    actions but Done) of those that lead nearer to a target that has been seen. Falls linearly to 0
-    at half of the budget. Not in the paper (docs/method.md)."""
+    """Initial weight of imitation in the loss: minus the logarithm of the probability, among all
+    actions but Done, of the moves that begin a shortest path to the target, once it has been seen.
+    Falls linearly to 0 at half of the budget. Not in the paper (docs/method.md)."""
     step_limit: int = 50
     """Actions after which a training episode is truncated."""
     partial_reward: Literal["parents", "similarity", "none"] = "parents"
@@ -452,9 +452,9 @@ BEST = TrainConfig(
     learner=LearnerConfig(gamma=0.97, size_noise=0.5, imitation_weight=0.3),
     network=NetworkConfig(odometry=True, triangulation=True, reach_threshold=0.5),
 )
-#: For robots: senses that err in training, by up to twice the levels of `mix`, and by up to 3 degrees
-#: of heading, which cost more than all else (docs/noise.md). Without what BEST has that has not been
-#: tried under noise yet: the estimate of reach, imitation and extra targets.
+#: For robots: senses that err in training, by up to twice the levels of `mix`, and by up to 3
+#: degrees of heading, which cost more than all else (docs/noise.md). Of BEST, it lacks what has not
+#: been tried under noise yet: the estimate of reach, imitation and extra targets.
 ROBUST = dataclasses.replace(
     BEST,
     extra_targets=None,

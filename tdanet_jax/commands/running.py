@@ -30,8 +30,9 @@ class Command:
     run: tyro.conf.OmitArgPrefixes[TrainConfig]
     preset: Literal["default", "best", "robust", "paper"] = "default"
     """Defaults of the other flags. best: --odometry, --triangulation, --reach-threshold 0.5,
-    --gamma 0.97 and --size-noise 0.5, which did best on validation. robust: the same without
-    --reach-threshold, with --robust-triangulation, --scores and --noise, for robots, whose senses
+    --gamma 0.97, --size-noise 0.5, --imitation-weight 0.3 and --extra-targets all, which did best
+    on validation. robust: the same without --reach-threshold, --imitation-weight and
+    --extra-targets, with --robust-triangulation, --scores and --noise, for robots, whose senses
     err. paper: the reference implementation's hyperparameters and its budget of 6 M episodes."""
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""

@@ -1,10 +1,11 @@
 """Imitation of shortest paths, for the first half of a run.
 
-Left to its rewards, an agent turns one way only: when it looks for its target, either way will do,
-and by the time that it knows where the target is, it has given up one of them. So training shows it
-which moves lead nearer, from the tables of distances. It does so only once the target has been seen
-in the episode: before, the shortest path depends on what the agent cannot know. It never says when
-to take `Done`: that is learnt from rewards, which weigh success against haste.
+Left to its rewards, an agent turns one way only. To look for its target, either way will do; by the
+time that training has taught it to go back to a target that it has seen, it has given up one of
+them. So training shows it which moves lead nearer, from the tables of distances: only once the
+target has been seen in the episode, for before, the shortest path depends on what the agent cannot
+know; and never when to take `Done`, which is learned from rewards, as they weigh success against
+haste.
 """
 
 from __future__ import annotations

@@ -114,25 +114,35 @@ def csv_sink(folder: Path | str) -> Callable[[Row], None]:
     """
     folder = Path(folder)
     path, failed = folder / CSV_FILE, False
+    columns: dict[str, None] = {}
 
     def text(rows: list[Row], header: bool) -> str:
         out = io.StringIO()
-        writer = csv.DictWriter(out, [*rows[0]], lineterminator="\n", extrasaction="ignore")
+        writer = csv.DictWriter(out, [*columns], lineterminator="\n", extrasaction="ignore")
         if header:
             writer.writeheader()
         writer.writerows(rows)
         return out.getvalue()
 
-    there = read_metrics(folder) if (folder / METRICS_FILE).exists() else []
-    files.write_text(path, text(there, header=True) if there else "")
+    def begin(rows: list[Row]) -> None:
+        """The file with these rows; rows of earlier versions may lack some columns."""
+        columns.update(dict.fromkeys(name for row in rows for name in row))
+        files.write_text(path, text(rows, header=True) if rows else "")
+
+    there: list[Row] | None = read_metrics(folder) if (folder / METRICS_FILE).exists() else []
+    begin(there or [])
 
     def write(row: Row) -> None:
-        nonlocal failed
+        nonlocal failed, there
         if failed:
             return
         try:
+            if there is not None:  # the first row says which columns there are
+                begin([*there, row])
+                there = None
+                return
             with path.open("a", encoding="utf-8") as file:
-                file.write(text([row], header=file.tell() == 0))
+                file.write(text([row], header=False))
         except OSError as error:
             failed = True
             warnings.warn(f"{path}: given up ({error.strerror})", stacklevel=2)

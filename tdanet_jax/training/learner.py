@@ -105,7 +105,7 @@ class Experience(NamedTuple):
 
 
 def make_optimizer(config: LearnerConfig) -> optax.GradientTransformation:
-    """Clipping and Adam; the learning rate is applied in `update`, which knows the progress.
+    """Clipping and Adam; the learning rate is applied in `learn`.
 
     AMSGrad is PyTorch's: the largest second moment is taken before the correction for its start.
     Of corrected ones, the first few gradients would be the largest for good.
@@ -266,6 +266,11 @@ def loss(
 
     If the network is still the one that acted, its values are those recorded while acting; only
     the gradients are new work.
+
+    Args:
+      weights: the network's parameters.
+      experience: what to learn from.
+      now: the weights of the loss's parts at this point of the budget.
     """
     steps, advantage, carry = experience
     class_table = actor_critic.prepare(model, weights, words)

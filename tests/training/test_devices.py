@@ -24,7 +24,8 @@ from jax.sharding import Mesh
 from tdanet_jax.training import learner
 from tests.training.test_learner import CONFIG, MODEL, PARAMS, WORDS
 
-config = dataclasses.replace(CONFIG, num_envs=24, num_minibatches=int(sys.argv[1]))
+parts = int(sys.argv[1])
+config = dataclasses.replace(CONFIG, num_envs=24, num_minibatches=parts, imitation_weight=0.3)
 init = jax.jit(lambda key: learner.init(key, config, MODEL, WORDS, PARAMS))
 ends = []
 for over in (Mesh(np.array(jax.devices()[:1]), (devices.AXIS,)), mesh):
@@ -44,7 +45,8 @@ for over in (Mesh(np.array(jax.devices()[:1]), (devices.AXIS,)), mesh):
     assert probs.addressable_shards[0].data.shape == (24 // over.size, 6)
     ends.append(jax.device_get((after.replace(key=0), metrics)))
 (one, one_metrics), (many, many_metrics) = ends
-for name in ("env_state", "bootstrap_only", "updates", "episodes"):  # what the actions led to
+# What the actions led to.
+for name in ("env_state", "bootstrap_only", "updates", "episodes", "target_seen"):
     same = jax.tree.map(np.array_equal, getattr(one, name), getattr(many, name))
     assert all(jax.tree.leaves(same)), name
 np.testing.assert_array_equal(one.recurrent.is_first, many.recurrent.is_first)

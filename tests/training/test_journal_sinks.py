@@ -41,6 +41,17 @@ def test_a_table_has_every_row_once_even_if_the_run_continues(tmp_path: Path) ->
     assert table(tmp_path) == [*expected[:2], expected[2] | {"success": "0.75"}]
 
 
+def test_a_table_has_the_columns_of_rows_that_an_earlier_version_wrote(tmp_path: Path) -> None:
+    Journal(tmp_path / "metrics.jsonl", 0).write(row(1, 0.5))
+    sink = csv_sink(tmp_path)
+    for number in (2, 3):  # with a column more, in between
+        sink({"updates": number, "share": 0.25, **row(number, 0.75)})
+    assert table(tmp_path) == [
+        {"updates": str(n), "steps": str(40 * n), "episodes": str(n), "success": s, "share": more}
+        for n, s, more in ((1, "0.5", ""), (2, "0.75", "0.25"), (3, "0.75", "0.25"))
+    ]
+
+
 def test_training_goes_on_without_a_table(tmp_path: Path) -> None:
     sink = csv_sink(tmp_path)
     (tmp_path / "metrics.csv").unlink()

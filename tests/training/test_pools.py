@@ -9,6 +9,7 @@ from pathlib import Path
 
 import chex
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -323,6 +324,18 @@ def test_keys_of_new_episodes_are_those_of_no_update(
     assert not np.array_equal(again.env_state.pose, update.pose)
     assert not again.bootstrap_only.any()
     assert again.recurrent.is_first.all()
+
+
+def test_targets_of_new_episodes_have_not_been_seen(
+    whole: tuple[Run, list[int], list[str], list[int]],
+) -> None:
+    run = whole[0]
+    learning = dataclasses.replace(TINY.learner, imitation_weight=0.3)
+    state = run.state.replace(target_seen=jnp.ones(learning.num_envs, bool))
+    begin = jax.jit(lambda state: learner.begin_again(state, learning, run.model, run.pools.params))
+    again = begin(state)
+    assert again.target_seen.shape == (learning.num_envs,)
+    assert not again.target_seen.any()
 
 
 def together(folder: Path, task: Task, config: TrainConfig = TINY) -> list[Run]:

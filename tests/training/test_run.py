@@ -62,11 +62,12 @@ def run_whole(folder, config, task):
 
 @pytest.fixture(scope="module")
 def sensing_whole(ithor, tmp_path_factory):
-    """The same, of an agent that senses its way and its target, and estimates reach."""
+    """The same, of an agent with sensors that estimates reach and imitates shortest paths."""
     network = dataclasses.replace(
         TINY.network, odometry=True, triangulation=True, reach_threshold=0.5
     )
-    config = dataclasses.replace(TINY, network=network)
+    learning = dataclasses.replace(TINY.learner, imitation_weight=0.3)
+    config = dataclasses.replace(TINY, network=network, learner=learning)
     task = make_task(config, ithor, words.load_bundled())
     return run_whole(tmp_path_factory.mktemp("sensing"), config, task)
 
@@ -94,7 +95,8 @@ def test_a_stopped_run_goes_on_bit_for_bit(which, tmp_path, request):
     sensors = again.state.env_state.sensors
     assert bool(sensors) == (which == "sensing_whole")
     assert not sensors or sensors["triangulation"].normal.any()
-    assert {"reach_loss" in row for row in whole[2]} == {which == "sensing_whole"}
+    for loss in ("reach_loss", "imitation_loss"):
+        assert {loss in row for row in whole[2]} == {which == "sensing_whole"}
     list(again.chunks())
     for ours, theirs in zip(leaves(again.state), leaves(whole[1].state), strict=True):
         np.testing.assert_array_equal(ours, theirs)

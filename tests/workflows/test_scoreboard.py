@@ -402,7 +402,7 @@ def test_rooms_and_targets_and_what_they_give_are_drawn(
 
 def test_an_agent_is_called_by_its_flags() -> None:
     row, paper = scoreboard.read(RESULTS / "18-4-best-0"), PRESETS["paper"]
-    assert row.agent == "tdanet --preset best"
+    assert dataclasses.replace(row, config=BEST).agent == "tdanet --preset best"
     network = dataclasses.replace(BEST.network, triangulation=False, reach_threshold=None)
     for config, agent in (
         (
