@@ -1,19 +1,19 @@
-"""Why episodes failed: the cause of each, and how far the target still was."""
+"""Why episodes failed, the cause of each, and where the paths of the others were long."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from tdanet_jax.analysis import trace
+from tdanet_jax.analysis import paths
 from tdanet_jax.analysis.episode_lookup import Recorded
+from tdanet_jax.analysis.paths import PARTS, Parts, Path
 from tdanet_jax.env.types import EnvParams
-from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.scenes import camera_view
 from tdanet_jax.scenes.tables import SceneTables
@@ -81,24 +81,17 @@ def find(records: Sequence[Recorded], tables: SceneTables, params: EnvParams) ->
       tables: the rooms in which they were recorded.
       params: of the same rooms (`Task.eval_params`).
     """
-    starts = Episodes(
-        np.concatenate([record.episode.pose for record in records]),
-        np.concatenate([record.episode.target for record in records]),
-    )
-    actions = np.full((len(records), max(len(r.actions) for r in records)), -1)
-    for row, record in zip(actions, records, strict=True):
-        row[: len(record.actions)] = record.actions
-    poses = trace.follow(starts, actions, params)
-    in_view = _in_view(tables)
+    return _failures(paths.follow(records, tables, params), tables)
+
+
+def _failures(followed: Iterable[Path], tables: SceneTables) -> list[Failure]:
     found = []
-    for i, record in enumerate(records):
-        goal = int(starts.target[i])
-        pose = poses[i, : len(record.actions) + 1]
-        in_reach = tables.distance[pose, goal] == 0
-        done = record.actions[-1] == Action.DONE
-        if done and in_reach[-1]:
+    for i, path in enumerate(followed):
+        if path.success:
             continue
-        cause = _cause(bool(done), in_reach, in_view[pose, goal])
+        record, pose = path.record, path.pose
+        done = record.actions[-1] == Action.DONE
+        cause = _cause(bool(done), path.distance == 0, path.in_view)
         early = cause == TOO_EARLY
         found.append(
             Failure(
@@ -106,12 +99,12 @@ def find(records: Sequence[Recorded], tables: SceneTables, params: EnvParams) ->
                 group=record.group,
                 scene=tables.scenes[tables.position_scene[tables.grid.split(pose[0]).position]],
                 room=tables.room_at(pose[0]),
-                target=tables.targets[goal],
+                target=tables.targets[path.goal],
                 cause=cause,
-                shortest=int(tables.distance[pose[0], goal]) + 1,
+                shortest=int(path.distance[0]) + 1,
                 length=len(record.actions),
-                missing_metres=_missing(tables, int(pose[-1]), goal) if early else None,
-                missing_actions=int(tables.distance[pose[-1], goal]) if early else None,
+                missing_metres=_missing(tables, int(pose[-1]), path.goal) if early else None,
+                missing_actions=int(path.distance[-1]) if early else None,
             )
         )
     return found
@@ -124,18 +117,6 @@ def _cause(done: bool, in_reach: np.ndarray, in_view: np.ndarray) -> str:
     if in_reach.any():
         return "limit_in_reach"
     return "limit_in_view" if in_view.any() else "limit_never_in_view"
-
-
-def _in_view(tables: SceneTables) -> np.ndarray:
-    """Whether a target has a box in the image: [S, G] bool."""
-    goal = np.full(len(tables.classes), -1)
-    for i, name in enumerate(tables.targets):
-        if name in tables.classes:
-            goal[tables.classes.index(name)] = i
-    rows = np.flatnonzero((goal[tables.row_class] >= 0) & (tables.row_box[:, 0] >= 0))
-    in_view = np.zeros((tables.num_states, len(tables.targets)), bool)
-    in_view[tables.row_state[rows], goal[tables.row_class[rows]]] = True
-    return in_view
 
 
 def _missing(tables: SceneTables, pose: int, goal: int) -> float | None:
@@ -154,19 +135,21 @@ def _missing(tables: SceneTables, pose: int, goal: int) -> float | None:
 
 @dataclasses.dataclass(frozen=True)
 class Summary:
-    """The failures of an agent.
+    """The failures of an agent, and the parts of its other paths.
 
     Attributes:
       agent: its name.
       split: of its episodes.
       failures: all of them.
       played: episodes by (group, room type, target).
+      parts: of the paths of a group's successes, if it has any.
     """
 
     agent: str
     split: str
     failures: Sequence[Failure]
     played: Mapping[tuple[str, str, str], int]
+    parts: Mapping[str, Parts]
 
     @property
     def groups(self) -> list[str]:
@@ -210,12 +193,18 @@ class Summary:
 def summarise(
     agent: str, split: str, records: Sequence[Recorded], tables: SceneTables, params: EnvParams
 ) -> Summary:
-    """The failures among all recorded episodes of an agent; arguments as for `find`."""
+    """What all recorded episodes of an agent show; arguments as for `find`."""
+    followed = list(paths.follow(records, tables, params))
+    parts = {
+        group: found
+        for group in dict.fromkeys(record.group for record in records)
+        if (found := paths.parts([p for p in followed if p.record.group == group]))
+    }
     played = Counter(
         (r.group, tables.room_at(int(r.episode.pose[0])), tables.targets[int(r.episode.target[0])])
         for r in records
     )
-    return Summary(agent, split, find(records, tables, params), dict(played))
+    return Summary(agent, split, _failures(followed, tables), dict(played), parts)
 
 
 def examples(summary: Summary, most: int) -> list[Failure]:
@@ -248,6 +237,7 @@ def to_json(summary: Summary) -> dict[str, Any]:
             group: {cause: summary.count(group=group, cause=cause) for cause in CAUSES}
             for group in summary.groups
         },
+        "paths": {group: _parts_as_json(parts) for group, parts in summary.parts.items()},
         "failures": [failure._asdict() for failure in summary.failures],
     }
 
@@ -286,6 +276,7 @@ def markdown(summary: Summary, picture: str, replays: Mapping[str, Failure]) -> 
     ]
     for title, keys in (("room type", summary.rooms()), ("target", summary.targets())):
         lines += ["", f"## By {title}", "", *_by_cause(summary, title, keys)]
+    lines += _paths(summary)
     if replays:
         lines += ["", "## Replays", ""]
     for page, f in replays.items():
@@ -295,6 +286,41 @@ def markdown(summary: Summary, picture: str, replays: Mapping[str, Failure]) -> 
             f"episode {f.episode}"
         )
     return "\n".join(lines) + "\n"
+
+
+def _parts_as_json(parts: Parts) -> dict[str, Any]:
+    """Means of the actions, of the excess, and SPL without it, by part."""
+    by_part = {
+        name: {
+            "actions": round(float(parts.actions[i]), 2),
+            "excess": round(float(parts.excess[i]), 2),
+            "SPL_without_excess": round(float(parts.spl_without[i]), 2),
+        }
+        for i, name in enumerate(PARTS)
+    }
+    return {"successes": parts.successes, "SPL": round(parts.spl, 2), **by_part}
+
+
+def _paths(summary: Summary) -> Iterator[str]:
+    """The section on the paths of the successes."""
+    yield from ("", "## Paths of the successes", "")
+    yield (
+        "Mean actions of each part of a path, how many of them the shortest path does without (the "
+        "excess), and what SPL over all episodes would be without these."
+    )
+    yield ""
+    yield from _row("Part", "Group", "Actions", "Excess", "SPL without", head=True)
+    for group, parts in summary.parts.items():
+        for i, (name, meaning) in enumerate(PARTS.items()):
+            values = (parts.actions[i], parts.excess[i], parts.spl_without[i])
+            yield from _row(f"{name}: {meaning}", group, *(f"{value:.1f}" for value in values))
+        yield from _row(
+            "all",
+            group,
+            f"{parts.actions.sum() + 1:.1f} with Done",
+            f"{parts.excess.sum():.1f}",
+            f"{parts.spl:.1f} with all",
+        )
 
 
 def _row(*cells: Any, head: bool = False) -> list[str]:

@@ -139,7 +139,7 @@ def summary():
         ("seen", "kitchen", "Bread"): 6,
         ("unseen", "kitchen", "Toaster"): 5,
     }
-    return Summary("mine", "18/4", listed, played)
+    return Summary("mine", "18/4", listed, played, {})
 
 
 def test_counts(summary):
@@ -178,7 +178,7 @@ def test_the_page_says_what_was_counted(summary):
 
 def test_the_picture_is_drawn_with_and_without_failures(summary, tmp_path):
     figures.failures(summary, tmp_path / "some.png")
-    figures.failures(Summary("mine", "18/4", [], summary.played), tmp_path / "none.png")
+    figures.failures(Summary("mine", "18/4", [], summary.played, {}), tmp_path / "none.png")
     assert (tmp_path / "some.png").stat().st_size > (tmp_path / "none.png").stat().st_size > 1000
 
 
