@@ -6,8 +6,8 @@ Parts are for a quick look and for questions of one's own; reports say that they
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -93,7 +93,9 @@ def find_names(flag: str, given: Collection[str], known: Iterable[str]) -> list[
             similar = {each.lower(): each for each in names}
             near = difflib.get_close_matches(name.lower(), similar, n=1)
             hint = f"did you mean {similar[near[0]]}?" if near else f"there are {', '.join(names)}"
-            if flag == "scenes" and Path(name).is_file():
+            if all(part in names for part in name.split(",")):
+                hint = "separate names with spaces"
+            if flag == "scenes" and os.path.isfile(name):  # of Path, a long name is an error
                 hint = "rooms of your own are imported (tdanet scenes import) and given with --data"
             raise ValueError(f"--{flag} {name}: in no test episode; {hint}")
     return list(given) or names

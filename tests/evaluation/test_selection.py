@@ -91,6 +91,11 @@ def test_rooms_and_targets_are_chosen_by_name(
             {"scenes": (__file__,)},
             f"--scenes {__file__}: in no test episode; rooms of your own are",
         ),
+        (
+            {"targets": ("Laptop,Pillow",)},
+            "--targets Laptop,Pillow: in no test episode; separate names with spaces",
+        ),
+        ({"scenes": ("a" * 9999,)}, f"--scenes {'a' * 9999}: in no test episode; there are"),
         ({"scenes": ("FloorPlan1",)}, "--scenes FloorPlan1: in no test episode; did you mean"),
         (
             {"scenes": ("FloorPlan228",), "targets": ("Toaster",)},
