@@ -12,7 +12,7 @@ import numpy as np
 
 from tdanet_jax.analysis import paths
 from tdanet_jax.analysis.episode_lookup import Recorded
-from tdanet_jax.analysis.paths import PARTS, Parts, Path
+from tdanet_jax.analysis.paths import PARTS, Parts, Trajectory
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.scenes import camera_view
@@ -84,7 +84,7 @@ def find(records: Sequence[Recorded], tables: SceneTables, params: EnvParams) ->
     return _failures(paths.follow(records, tables, params), tables)
 
 
-def _failures(followed: Iterable[Path], tables: SceneTables) -> list[Failure]:
+def _failures(followed: Iterable[Trajectory], tables: SceneTables) -> list[Failure]:
     found = []
     for i, path in enumerate(followed):
         if path.success:

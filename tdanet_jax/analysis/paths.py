@@ -22,7 +22,7 @@ PARTS = {
 }
 
 
-class Path(NamedTuple):
+class Trajectory(NamedTuple):
     """A recorded episode of T actions, and what held before each of them and at the end."""
 
     record: Recorded
@@ -51,7 +51,9 @@ class Parts(NamedTuple):
     successes: int
 
 
-def follow(records: Sequence[Recorded], tables: SceneTables, params: EnvParams) -> Iterator[Path]:
+def follow(
+    records: Sequence[Recorded], tables: SceneTables, params: EnvParams
+) -> Iterator[Trajectory]:
     """The paths of recorded episodes, in their order.
 
     Args:
@@ -71,7 +73,7 @@ def follow(records: Sequence[Recorded], tables: SceneTables, params: EnvParams) 
     for i, record in enumerate(records):
         goal, pose = int(starts.target[i]), poses[i, : len(record.actions) + 1]
         distance = tables.distance[pose, goal].astype(int)
-        yield Path(record, goal, pose, distance, in_view[pose, goal])
+        yield Trajectory(record, goal, pose, distance, in_view[pose, goal])
 
 
 def targets_in_view(tables: SceneTables) -> np.ndarray:
@@ -86,7 +88,7 @@ def targets_in_view(tables: SceneTables) -> np.ndarray:
     return in_view
 
 
-def parts(paths: Sequence[Path]) -> Parts | None:
+def parts(paths: Sequence[Trajectory]) -> Parts | None:
     """What the parts of the paths of a group cost; None without a success.
 
     Args:
