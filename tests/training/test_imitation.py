@@ -171,7 +171,7 @@ def test_it_is_part_of_every_minibatch() -> None:
 
 @pytest.mark.slow
 def test_it_teaches_the_way_to_a_target_that_was_seen() -> None:
-    config = dataclasses.replace(CONFIG, imitation_weight=1.0, learning_rate=5e-3)
+    config = dataclasses.replace(CONFIG, imitation_weight=3.0, learning_rate=2e-2)
     state, losses = house.start(0, config), []
     for _ in range(60):
         rest = (house.MODEL, house.WORDS, house.PARAMS)
