@@ -37,11 +37,9 @@ def records(task: Task, world: World) -> list[Recorded]:
         actions = [int(a) for a in rng.choice(DONE, int(rng.integers(0, 8)))]
         for action in actions:
             here = world.moved(here, action)
-        while distance := world.distance(world.state_of(here), name):
-            ways = [world.moved(here, action) for action in range(DONE)]
-            nearer = [world.distance(world.state_of(way), name) < distance for way in ways]
-            actions.append(nearer.index(True))
-            here = ways[actions[-1]]
+        while (action := world.best_action(here, name)) != DONE:
+            actions.append(action)
+            here = world.moved(here, action)
         actions += [1, 2] * int(rng.integers(0, 3))
         if rng.random() < 0.8:
             actions.append(DONE)

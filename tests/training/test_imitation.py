@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import dataclasses
 import functools
 from typing import Any
@@ -27,32 +26,18 @@ MOVES = [a for a in range(NUM_ACTIONS) if a != Action.DONE]
 
 
 @functools.cache
-def far(target: str) -> dict[int, int]:
-    """Fewest moves from each pose until the target is visible, by breadth-first search."""
-    states = range(house.TABLES.num_states)
-    before = collections.defaultdict(list)
-    for state in states:
-        for action in MOVES:
-            before[WORLD.state_of(WORLD.moved(WORLD.pose_of(state), action))].append(state)
-    found = {state: 0 for state in states if target in WORLD.visible(state)}
-    queue = collections.deque(found)
-    while queue:
-        state = queue.popleft()
-        for other in before[state]:
-            if other not in found:
-                found[other] = found[state] + 1
-                queue.append(other)
-    return found
+def far(state: int, target: str) -> int | None:
+    """Fewest moves until the target is visible."""
+    return WORLD.distance(state, target)
 
 
 def best(target: str, state: int) -> list[bool]:
     """Which actions begin a shortest path."""
-    distance = far(target)
-    here = distance.get(state)
+    here = far(state, target)
     if here in (None, 0):
         return [name == "Done" and here == 0 for name in ACTION_NAMES]
     there = [WORLD.state_of(WORLD.moved(WORLD.pose_of(state), a)) for a in range(NUM_ACTIONS)]
-    return [a in MOVES and distance.get(there[a]) == here - 1 for a in range(NUM_ACTIONS)]
+    return [a in MOVES and far(there[a], target) == here - 1 for a in range(NUM_ACTIONS)]
 
 
 def test_best_actions_begin_the_shortest_paths() -> None:
