@@ -36,6 +36,9 @@ class EvalConfig:
     """Play only the test episodes in these rooms, such as FloorPlan228."""
     targets: tuple[str, ...] = ()
     """Play only the test episodes with these targets, such as Laptop."""
+    training_rooms: bool = False
+    """Play as many episodes in the training rooms instead of the test rooms, to see what it costs
+    an agent that rooms are new to it."""
     noise: str | None = None
     """Senses that err: detector, wheels, mix, or levels such as misses=0.2,jitter=0.1
     (docs/noise.md). The command also takes sweep: five levels of each kind of noise."""
@@ -62,6 +65,7 @@ class EvalConfig:
     def departures(self) -> dict[str, Any]:
         """The values, by name, for which this is not the official test; none if it is."""
         values = {name: getattr(self, name) for name in ("step_limit", "episodes")}
+        values["training_rooms"] = self.training_rooms
         values |= {name: list(getattr(self, name)) for name in ("scenes", "targets")}
         if self.senses.any:
             values["noise"] = str(self.senses)
@@ -118,6 +122,7 @@ def describe_departures(departures: Mapping[str, Any]) -> str:
     texts = {
         "step_limit": "at most {} actions per episode",
         "episodes": "at most {} episodes of each list, evenly spaced",
+        "training_rooms": "in the training rooms",
         "scenes": "only in {}",
         "targets": "only for {}",
         "noise": "senses that err, {}",

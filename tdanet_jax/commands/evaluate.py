@@ -134,7 +134,7 @@ def play(command: Command, config: TrainConfig, folder: Path) -> None:
     runs = command.checkpoint
     several = command.history or len(runs) > 1
     if not several:
-        console.print("playing the test episodes ...")
+        console.print("playing the episodes ...")
     with reporter("evaluating") if several else contextlib.nullcontext() as show:
         results = evaluate(
             runs if several else runs[0] if runs else None,

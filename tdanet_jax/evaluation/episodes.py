@@ -115,6 +115,12 @@ def draw_split(tables: SceneTables, split: Split) -> dict[str, Episodes]:
     return lists
 
 
+def in_training_rooms(tables: SceneTables, split: Split) -> dict[str, Episodes]:
+    """Episodes in a split's training rooms, by group, drawn as its test episodes are."""
+    lists = draw_split(tables, dataclasses.replace(split, eval_scenes=split.train_scenes))
+    return {group: episodes for group, episodes in lists.items() if len(episodes)}
+
+
 def build_asset(tables: SceneTables, out_dir: Path | str) -> Path:
     """Writes the lists of every published split, and of its validation, for these tables."""
     out_dir = Path(out_dir)

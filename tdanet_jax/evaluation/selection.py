@@ -32,7 +32,11 @@ def select(task: Task, test: EvalConfig) -> tuple[EnvParams, dict[str, Episodes]
       ValueError: a value is out of range, a name is unknown, or no episode is left.
     """
     test.check()
-    lists = choose(episodes.load(task.tables, task.split, task.extras), task.tables, test)
+    if test.training_rooms:
+        lists = episodes.in_training_rooms(task.tables, task.split)
+    else:
+        lists = episodes.load(task.tables, task.split, task.extras)
+    lists = choose(lists, task.tables, test)
     params = task.eval_params
     if test.step_limit is not None:
         params = params.replace(step_limit=jnp.full_like(params.step_limit, test.step_limit))

@@ -154,7 +154,8 @@ def _write(
             for run, name in names.items()
         ]
         picture = folder / "learning_curve.png"
-        figures.evaluated_curves(curves, "Test rooms, while training", picture)
+        where = "Training rooms" if networks[0].test.training_rooms else "Test rooms"
+        figures.evaluated_curves(curves, f"{where}, while training", picture)
     files.write_text(folder / "evaluations.json", json.dumps(results, indent=2) + "\n")
 
 

@@ -304,6 +304,7 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--episodes": "--episodes 9",
             "--scenes": "--scenes FloorPlan21",
             "--targets": "--targets Mug",
+            "--training-rooms": "--training-rooms",
             "--noise": "--noise mix",
             "--reach-threshold": "--reach-threshold 0.5",
             "--test-targets": "--test-targets Mug",

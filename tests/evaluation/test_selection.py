@@ -179,6 +179,23 @@ def test_a_policy_is_tested_on_any_targets(
         )
 
 
+@pytest.mark.usefixtures("ithor")
+def test_as_many_episodes_are_played_in_the_training_rooms(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    evaluate.main(["--policy", "shortest_path", "--training-rooms", "--out", str(out)])
+    results = json.loads((out / "results.json").read_text())
+    assert results["departures"] == {"training_rooms": True}
+    assert "**Not the official test: in the training rooms.**" in (out / "results.md").read_text()
+    records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    split = make_split("18/4")
+    assert {record["scene"] for record in records} <= {*split.train_scenes}
+    for group, targets in (("seen", split.seen), ("unseen", split.unseen)):
+        rooms = [r["room"] for r in records if r["group"] == group]
+        assert {room: rooms.count(room) for room in targets} == dict.fromkeys(targets, 250)
+        assert all(r["target"] in targets[r["room"]] for r in records if r["group"] == group)
+        assert results[group]["L>=1"]["SR"] == 100
+
+
 @pytest.mark.slow
 def test_a_run_is_evaluated_with_another_threshold_of_reach(
     ithor: SceneTables, glove: WordVectors, tmp_path: Path

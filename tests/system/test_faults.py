@@ -247,7 +247,7 @@ def test_a_signal_waits_until_a_library_is_loaded(
     assert loaded == "True"
     if done.stderr:
         assert done.stderr == "stopped\n"
-        assert said in ([], ["playing the test episodes ..."])
+        assert said in ([], ["playing the episodes ..."])
     else:
         assert [line for line in said if "stop" in line] == said[-1:]
         assert said[-1].startswith("stopped; ")
