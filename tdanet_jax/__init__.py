@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         load,
     )
     from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+    from tdanet_jax.decisions import Decisions
     from tdanet_jax.eval_config import EvalConfig
     from tdanet_jax.task import make
     from tdanet_jax.training.callbacks import Callbacks
@@ -37,6 +38,7 @@ _PUBLIC = {
     "Callbacks": "training.callbacks",
     "Camera": "agent",
     "Decision": "agent",
+    "Decisions": "decisions",
     "Detection": "agent",
     "EvalConfig": "eval_config",
     "LearnerConfig": "config",
@@ -56,6 +58,7 @@ __all__ = [
     "Callbacks",
     "Camera",
     "Decision",
+    "Decisions",
     "Detection",
     "EvalConfig",
     "LearnerConfig",

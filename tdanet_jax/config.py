@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tdanet_jax import sense_noise
+from tdanet_jax.decisions import Decisions
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import FileError, jsons, regular
 from tdanet_jax.observation_spec import ObservationSpec
@@ -129,6 +130,12 @@ class NetworkConfig:
     within reach with this probability or more. It is estimated from triangulation alone, and
     therefore for unseen classes, too (docs/method.md). 0: estimated, but Done is always allowed.
     None: not estimated."""
+    temperature: float = 1.0
+    """Temperature at which actions are sampled after training. Below 1, the most probable ones are
+    taken more often than in training (docs/method.md)."""
+    done_bias: float = 0.0
+    """Added to the logit of Done after training. Above 0, the agent says it earlier than in
+    training (docs/method.md)."""
     scores: bool = False
     """Show the detector's confidence in each detection, 1 without noise. Not in the paper; for
     models that are shown a box of every object."""
@@ -142,6 +149,11 @@ class NetworkConfig:
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """Precision of the operands of large matrix products; parameters and sums are always float32.
     auto: bfloat16 on accelerators and on CPUs with AMX, where it is faster."""
+
+    @property
+    def decisions(self) -> Decisions:
+        """How the trained network decides."""
+        return Decisions(self.reach_threshold, self.temperature, self.done_bias)
 
     @property
     def spec(self) -> ObservationSpec:
@@ -260,6 +272,7 @@ class TrainConfig:
         if self.generated_only and self.variants:
             raise ValueError("--generated-only: not with --variants, which are of other rooms")
         sense_noise.parse(self.learner.noise)
+        self.network.decisions.check()
         if self.network.robust_triangulation and not self.network.triangulation:
             raise ValueError("--robust-triangulation: needs --triangulation")
         if self.network.reach_threshold is not None and not self.network.triangulation:
@@ -316,21 +329,16 @@ class TrainConfig:
         return self.learner.num_envs * self.learner.rollout_steps
 
 
-def with_reach_threshold(
-    config: TrainConfig, threshold: float | None, run: Path | str
-) -> TrainConfig:
-    """A run's configuration with another threshold of reach, unless that is None.
+def with_decisions(config: TrainConfig, decisions: Decisions, run: Path | str) -> TrainConfig:
+    """A run's configuration with other decisions of its trained network.
 
     Raises:
-      ValueError: the run has no estimate of reach, or the threshold is out of range.
+      ValueError: the run has no estimate of reach, or a value is out of range.
     """
-    if threshold is None:
-        return config
-    if not (fits(threshold, float) and 0 <= threshold < 1):
-        raise ValueError(f"--reach-threshold {threshold}: must be at least 0 and below 1")
-    if config.network.reach_threshold is None:
+    decisions.check()
+    if decisions.reach_threshold is not None and config.network.reach_threshold is None:
         raise ValueError(f"--reach-threshold: {run} was trained without it")
-    network = dataclasses.replace(config.network, reach_threshold=threshold)
+    network = dataclasses.replace(config.network, **decisions.given)
     return dataclasses.replace(config, network=network)
 
 
@@ -398,7 +406,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     (("generated",), lambda value: value <= MOST_GENERATED, f"be at most {MOST_GENERATED:,}"),
     (("size_noise",), lambda value: 0 <= value <= 2, "be between 0 and 2"),
     (("gamma", "gae_lambda"), lambda value: 0 <= value <= 1, "be between 0 and 1"),
-    (("dropout", "reach_threshold"), lambda value: 0 <= value < 1, "be at least 0 and below 1"),
+    (("dropout",), lambda value: 0 <= value < 1, "be at least 0 and below 1"),
 )  # fmt: skip
 
 
@@ -450,11 +458,13 @@ PAPER = TrainConfig(
 BEST = TrainConfig(
     extra_targets="all",
     learner=LearnerConfig(gamma=0.97, size_noise=0.5, imitation_weight=0.3),
-    network=NetworkConfig(odometry=True, triangulation=True, reach_threshold=0.5),
+    network=NetworkConfig(
+        odometry=True, triangulation=True, reach_threshold=0.5, temperature=0.3, done_bias=2.0
+    ),
 )
 #: For robots: senses that err in training, by up to twice the levels of `mix`, and by up to 3
 #: degrees of heading, which cost more than all else (docs/noise.md). Of BEST, it lacks what has not
-#: been tried under noise yet: the estimate of reach, imitation and extra targets.
+#: been tried under noise yet: the estimate of reach, imitation, extra targets, and how it decides.
 ROBUST = dataclasses.replace(
     BEST,
     extra_targets=None,
@@ -466,7 +476,12 @@ ROBUST = dataclasses.replace(
         ),
     ),
     network=dataclasses.replace(
-        BEST.network, robust_triangulation=True, scores=True, reach_threshold=None
+        BEST.network,
+        robust_triangulation=True,
+        scores=True,
+        reach_threshold=None,
+        temperature=1.0,
+        done_bias=0.0,
     ),
 )
 PRESETS = {"default": TrainConfig(), "best": BEST, "robust": ROBUST, "paper": PAPER}

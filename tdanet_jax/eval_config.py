@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from tdanet_jax import sense_noise
-from tdanet_jax.config import TrainConfig, find_word_vectors, fits, with_reach_threshold
+from tdanet_jax.config import TrainConfig, find_word_vectors, fits, with_decisions
+from tdanet_jax.decisions import Decisions
 from tdanet_jax.sense_noise import SenseNoise
 from tdanet_jax.splits import OPEN
 from tdanet_jax.targets import canonical, known_classes, naming, parse
 
 
 @dataclasses.dataclass(frozen=True)
-class EvalConfig:
+class EvalConfig(Decisions):
     """Where an evaluation departs from the run's own task."""
 
     data: str | None = None
@@ -42,12 +43,10 @@ class EvalConfig:
     noise: str | None = None
     """Senses that err: detector, wheels, mix, or levels such as misses=0.2,jitter=0.1
     (docs/noise.md). The command also takes sweep: five levels of each kind of noise."""
-    reach_threshold: float | None = None
-    """Probability of reach from which Done is allowed, instead of the run's; only for runs that
-    were trained with one. 0 allows Done everywhere."""
 
     def check(self) -> None:
         """Raises ValueError, with one line that names the flag, if a value is out of range."""
+        super().check()
         for name, value in (("step-limit", self.step_limit), ("episodes", self.episodes)):
             if value is not None and (not fits(value, int) or value < 1):
                 raise ValueError(f"--{name} {value}: must be a positive integer")
@@ -69,10 +68,7 @@ class EvalConfig:
         values |= {name: list(getattr(self, name)) for name in ("scenes", "targets")}
         if self.senses.any:
             values["noise"] = str(self.senses)
-        departures = {name: value for name, value in values.items() if value}
-        if self.reach_threshold is not None:
-            departures["reach_threshold"] = self.reach_threshold
-        return departures
+        return {name: value for name, value in values.items() if value} | self.given
 
     def locate(self, config: TrainConfig, run: Path | str) -> TrainConfig:
         """A run's configuration as it is evaluated, with its files and no rooms to train in alone.
@@ -97,7 +93,7 @@ class EvalConfig:
                 )
         config = self.with_targets(dataclasses.replace(config, data=data))
         words = find_word_vectors(config, run, self.word_vectors)
-        config = with_reach_threshold(config.in_rooms_alone(), self.reach_threshold, run)
+        config = with_decisions(config.in_rooms_alone(), self, run)
         return dataclasses.replace(config, word_vectors=words)
 
     def with_targets(self, config: TrainConfig) -> TrainConfig:
@@ -127,6 +123,8 @@ def describe_departures(departures: Mapping[str, Any]) -> str:
         "targets": "only for {}",
         "noise": "senses that err, {}",
         "reach_threshold": "Done with a probability of reach of {} or more",
+        "temperature": "actions sampled at temperature {}",
+        "done_bias": "{} added to the logit of Done",
     }
     parts = [
         text.format(

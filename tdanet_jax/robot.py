@@ -12,12 +12,14 @@ from tdanet_jax.agent.detection import Detection
 from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
 from tdanet_jax.agent.numpy_agent import AgentState, load
 from tdanet_jax.agent.numpy_agent import NumPyAgent as Agent
+from tdanet_jax.decisions import Decisions
 
 __all__ = [
     "Agent",
     "AgentState",
     "Camera",
     "Decision",
+    "Decisions",
     "Detection",
     "Navigator",
     "NavigatorConfig",

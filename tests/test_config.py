@@ -80,6 +80,9 @@ def test_paper_preset_has_the_reference_constants():
             ),
             "--reach-threshold 1.0: must be at least 0 and below 1",
         ),
+        (TrainConfig(network=NetworkConfig(temperature=0)), "--temperature 0: must be between"),
+        (TrainConfig(network=NetworkConfig(done_bias=-101.0)), "--done-bias -101.0: must be"),
+        (TrainConfig(network=NetworkConfig(done_bias=float("nan"))), "--done-bias nan: must be"),
         (
             TrainConfig(network=NetworkConfig(odometry=True, triangulation=True, rows="class")),
             "--triangulation: needs a box of every object, which --rows class does not show",
@@ -103,6 +106,7 @@ def test_the_robust_preset_is_the_best_with_senses_that_err():
     assert configs.PRESETS["robust"].learner.noise == noise
     assert configs.PRESETS["robust"].network.spec.sensors == ("odometry", "robust-triangulation")
     changed = {"noise", "robust_triangulation", "scores", "reach_threshold", "imitation_weight"}
+    changed |= {"temperature", "done_bias"}
     assert configs.ROBUST.extra_targets is None
     differ = set()
     for part in ("learner", "network"):

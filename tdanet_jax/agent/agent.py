@@ -20,7 +20,8 @@ from tdanet_jax import config as configs
 from tdanet_jax import words
 from tdanet_jax.agent.base import BaseAgent, Decision, sigmoid, softmax, without
 from tdanet_jax.agent.detection import Detection
-from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors, with_reach_threshold
+from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors, with_decisions
+from tdanet_jax.decisions import OWN, Decisions
 from tdanet_jax.env.types import Observation
 from tdanet_jax.io.bundled_agents import find_run, folder_of
 from tdanet_jax.labels import Synonyms
@@ -317,18 +318,15 @@ def _decision(
     """The state after a step, and the decision, from what `Agent._forward` gives."""
     # In NumPy: each single operation of JAX would be compiled, and take longer than the network.
     logits = np.asarray(out.logits)[0]
-    probabilities = np.asarray(state.recurrent.prev_action_probs)[0]
     if forbidden:
         logits = without(logits, forbidden)
-    if forbidden or out.reach_logit is not None:
-        probabilities = softmax(logits)
     reach = None
     if out.reach_logit is not None and np.isfinite(logit := np.asarray(out.reach_logit)[0]):
         reach = float(sigmoid(logit))
     action = Action(int(np.argmax(logits) if key is None else _sample(key, logits)))
     decision = Decision(
         action=action,
-        probabilities=probabilities,
+        probabilities=softmax(logits),
         value=float(np.asarray(out.value)[0]),
         attention=None if attention is None else np.asarray(attention)[0][owner],
         reach=reach,
@@ -341,7 +339,7 @@ def load(
     grid: PoseGrid = ITHOR,
     word_vectors: Path | str | None = None,
     synonyms: Synonyms | Path | str | None = None,
-    reach_threshold: float | None = None,
+    decisions: Decisions = OWN,
 ) -> Agent:
     """The agent of a run's newest checkpoint, or of a point of its history. Needs no rooms.
 
@@ -353,16 +351,15 @@ def load(
       word_vectors: file of word vectors in place of the run's copy, for example with more words;
         they must be as wide.
       synonyms: other names of things, {"Mug": ["beaker"]}, or a JSON file of them.
-      reach_threshold: the probability of reach from which `Done` is allowed, in place of the run's;
-        0 allows it everywhere.
+      decisions: how the agent decides, in place of the run's settings.
 
     Raises:
       ValueError: the folder holds no run, its checkpoint cannot be read, its word vectors are
-        missing or of another width, or there is a threshold of reach but no estimate in the run.
+        missing or of another width, or `decisions` do not fit the run.
     """
     run = find_run(run)
     config, weights, classes = read(run)
-    config = with_reach_threshold(config, reach_threshold, run)
+    config = with_decisions(config, decisions, run)
     path = find_word_vectors(config, folder_of(run), word_vectors)
     vectors = words.load_word_vectors(path, classes.names)
     agent = Agent(config, weights, vectors, classes, grid, synonyms)

@@ -20,6 +20,7 @@ import numpy as np
 from tdanet_jax import words
 from tdanet_jax.agent.base import BaseAgent, Decision, sigmoid, softmax, without
 from tdanet_jax.agent.detection import Detection
+from tdanet_jax.decisions import OWN, Decisions
 from tdanet_jax.io.untrusted import FileError, npz
 from tdanet_jax.labels import Synonyms
 from tdanet_jax.observation_spec import TRACKING, ObservationSpec
@@ -49,6 +50,8 @@ class Meta:
     action_units: int  # that embed the previous step's action probabilities
     sensor_units: int  # that embed what the sensors say; 0 without sensors
     reach_threshold: float  # as in NetworkConfig; 0 if reach is not estimated, too
+    temperature: float  # as in NetworkConfig
+    done_bias: float  # as in NetworkConfig
     reach_units: int  # of each hidden layer of the estimate of reach; 0 without it
     target_box: tuple[float, ...]  # [F], of the target's row, before its word vector
 
@@ -63,10 +66,10 @@ class Meta:
 _KINDS: dict[str, type] = {
     "classes": list, "rows": str, "sensors": list, "scores": bool, "word_norm": float,
     "width": int, "hidden": int, "action_units": int, "sensor_units": int, "target_box": list,
-    "reach_threshold": float, "reach_units": int,
+    "reach_threshold": float, "reach_units": int, "temperature": float, "done_bias": float,
 }  # fmt: skip
 #: Fields that folders of older versions lack.
-_DEFAULTS = {"reach_threshold": 0.0, "reach_units": 0}
+_DEFAULTS = {"reach_threshold": 0.0, "reach_units": 0, "temperature": 1.0, "done_bias": 0.0}
 
 
 class AgentState(NamedTuple):
@@ -150,17 +153,16 @@ class NumPyAgent(BaseAgent):
         action_features = _relu(self._layer("action_embedding", state.probabilities))
         hidden, cell = self._lstm(features, action_features, state.hidden, state.cell)
         logits = self._layer("actor", hidden)
-        probabilities = shown = softmax(logits)
-        reach = None
+        probabilities, reach = softmax(logits), None
+        logits[Action.DONE] += self.meta.done_bias
+        logits /= np.float32(self.meta.temperature)
         if self.meta.reach_units:
             reach = self._reach(sensors) if goal in labels else None
             if (reach or 0.0) < self.meta.reach_threshold:
                 logits[Action.DONE] = OUT_OF_REACH
-                shown = softmax(logits)
         if forbidden:
             logits = without(logits, forbidden)
-            shown = softmax(logits)
-        action = int(np.argmax(logits))
+        shown, action = softmax(logits), int(np.argmax(logits))
         if key is not None:
             action = int(key.choice(NUM_ACTIONS, p=shown / shown.sum(dtype=float)))
         value = float(self._layer("critic", hidden)[0])
@@ -238,7 +240,7 @@ def load(
     folder: Path | str,
     grid: PoseGrid = ITHOR,
     synonyms: Synonyms | Path | str | None = None,
-    reach_threshold: float | None = None,
+    decisions: Decisions = OWN,
 ) -> NumPyAgent:
     """An exported agent.
 
@@ -246,21 +248,18 @@ def load(
       folder: that `tdanet export` wrote.
       grid: the turns and steps of the world in which the agent acts, if it has sensors.
       synonyms: other names of things, {"Mug": ["beaker"]}, or a JSON file of them.
-      reach_threshold: the probability of reach from which `Done` is allowed, in place of the run's;
-        0 allows it everywhere.
+      decisions: how the agent decides, in place of the run's settings.
 
     Raises:
       ValueError: a file is missing, damaged or does not fit the others, and the message names it;
-        or there is a threshold of reach but no estimate.
+        or `decisions` do not fit the agent.
     """
     folder = Path(folder)
     meta = _read_meta(folder / META_FILE)
-    if reach_threshold is not None:
-        if not 0 <= reach_threshold < 1:
-            raise ValueError(f"reach_threshold {reach_threshold}: must be at least 0 and below 1")
-        if not meta.reach_units:
-            raise ValueError(f"reach_threshold: {folder} estimates no reach")
-        meta = dataclasses.replace(meta, reach_threshold=reach_threshold)
+    decisions.check()
+    if decisions.reach_threshold is not None and not meta.reach_units:
+        raise ValueError(f"--reach-threshold: {folder} was trained without it")
+    meta = dataclasses.replace(meta, **decisions.given)
     vectors = words.load_word_vectors(folder / WORDS_FILE)
     weights = npz.read(folder / MODEL_FILE)
     expected = shapes(meta, vectors.vectors.shape[1])

@@ -25,6 +25,7 @@ import tyro
 from tdanet_jax.agent.camera import Camera
 from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
 from tdanet_jax.commands.console import RunPath, one_line_errors, parse
+from tdanet_jax.decisions import OWN, Decisions
 
 #: Bytes of a line.
 LONGEST = 1 << 20
@@ -52,9 +53,7 @@ class Command:
     """File of further words, in GloVe's text format: a word and its numbers on each line."""
     synonyms: Path | None = None
     """JSON file of other names: {"Mug": ["beaker"]}."""
-    reach_threshold: float | None = None
-    """Probability of reach from which Done is allowed, instead of the run's. 0 allows Done
-    everywhere."""
+    decisions: tyro.conf.OmitArgPrefixes[Decisions] = OWN
 
     @property
     def camera(self) -> Camera:
@@ -81,7 +80,7 @@ def main(arguments: list[str] | None = None) -> None:
             command.checkpoint,
             word_vectors=command.word_vectors,
             synonyms=command.synonyms,
-            reach_threshold=command.reach_threshold,
+            decisions=command.decisions,
         )
         if command.words is not None:
             agent.add_words(command.words)

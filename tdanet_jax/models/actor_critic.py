@@ -18,7 +18,7 @@ from tdanet_jax.models.lstm import LSTM, Carry
 from tdanet_jax.models.reach import ReachEstimate, mask_done
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.sensors import suite
-from tdanet_jax.vocabulary import NUM_ACTIONS
+from tdanet_jax.vocabulary import NUM_ACTIONS, Action
 
 #: Units of the layer that embeds the sensors' features.
 SENSOR_UNITS = 64
@@ -57,6 +57,8 @@ class ActorCritic(nn.Module):
         encoder's; the paper's agent has no sensors.
       reach_threshold: after training, `Done` is only allowed where the target is in view, and
         within reach with this estimated probability or more; None if there is no estimate.
+      temperature: of the policy after training.
+      done_bias: added to the logit of `Done` after training.
     """
 
     encoder: Encoder
@@ -65,6 +67,8 @@ class ActorCritic(nn.Module):
     dtype: Any = jnp.float32
     spec: ObservationSpec = ObservationSpec()
     reach_threshold: float | None = None
+    temperature: float = 1.0
+    done_bias: float = 0.0
 
     def setup(self) -> None:
         if self.spec.sensors:
@@ -209,19 +213,32 @@ def act(
     Args:
       collections: Flax collections to return: `ACTIVATIONS` while training, "intermediates" for the
         attention, its logits and the Siamese difference.
-      training: the rule on `Done` (`reach_threshold`) is not applied.
+      training: the policy is the network's own; after training, `decided` changes it.
 
     Returns:
       The state after the step, policy and value, and the collections by name. The state remembers
-      the probabilities without the rule, as in training.
+      the probabilities of the network's own policy, as in training.
     """
     inputs = (class_table, state.carry, obs, state.prev_action_probs, state.is_first, dropout_mask)
     (carry, out), kept = model.apply({"params": weights}, *inputs, mutable=list(collections))
     after = RecurrentState(carry, jax.nn.softmax(out.logits), jnp.zeros_like(state.is_first))
-    if model.reach_threshold and not training:
-        logits = mask_done(out.logits, out.reach_logit, obs.target_in_view, model.reach_threshold)
-        out = out._replace(logits=logits)
+    if not training:
+        out = out._replace(logits=decided(model, out, obs.target_in_view))
     return after, out, kept
+
+
+def decided(model: ActorCritic, out: Output, in_view: jax.Array) -> jax.Array:
+    """The logits [..., 6] with which a trained network acts.
+
+    Args:
+      out: what the network says.
+      in_view: [...] bool, whether the target is in view.
+    """
+    logits = out.logits.at[..., Action.DONE].add(model.done_bias) / model.temperature
+    if model.reach_threshold:
+        assert out.reach_logit is not None
+        logits = mask_done(logits, out.reach_logit, in_view, model.reach_threshold)
+    return logits
 
 
 def forward(

@@ -45,7 +45,12 @@ def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
     if network.reach_threshold is not None and isinstance(model, AdaptiveActorCritic):
         raise ValueError(f"--reach-threshold: not with {config.model}, which adapts while it acts")
     suite.make(spec)  # a sensor that cannot be made is refused here, too
-    return model.clone(spec=spec, reach_threshold=network.reach_threshold)
+    return model.clone(
+        spec=spec,
+        reach_threshold=network.reach_threshold,
+        temperature=network.temperature,
+        done_bias=network.done_bias,
+    )
 
 
 def resolve_precision(config: NetworkConfig) -> NetworkConfig:

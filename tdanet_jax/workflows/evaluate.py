@@ -108,8 +108,8 @@ def _evaluate_policy(
     folder: Path | None,
 ) -> dict[str, Any]:
     """A policy without a checkpoint."""
-    if test.reach_threshold is not None:
-        raise ValueError("--reach-threshold: needs a checkpoint, whose agent estimates reach")
+    if given := [*test.given]:
+        raise ValueError(f"--{given[0].replace('_', '-')}: needs a checkpoint, whose agent decides")
     name = policy if isinstance(policy, str) else "custom"
     if isinstance(policy, str):
         if policy not in UNTRAINED:

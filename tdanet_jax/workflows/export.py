@@ -26,7 +26,7 @@ from tdanet_jax.sensors.numpy_sensors import WIDTHS
 #: What `tdanet_jax.robot` imports: the modules that are copied, which need NumPy alone.
 MODULES = (
     "agent/__init__", "agent/base", "agent/camera", "agent/detection", "agent/detectors",
-    "agent/navigator", "agent/numpy_agent", "io/__init__", "io/archive", "io/assets",
+    "agent/navigator", "agent/numpy_agent", "decisions", "io/__init__", "io/archive", "io/assets",
     "io/escaping", "io/files", "io/untrusted/__init__", "io/untrusted/budgets",
     "io/untrusted/hdf5", "io/untrusted/npz", "io/untrusted/regular", "labels", "observation_spec",
     "poses", "registry", "sensors/__init__", "sensors/detections", "sensors/numpy_sensors",
@@ -92,6 +92,8 @@ def _write_agent(agent: Agent, word_vectors: str | None, folder: Path) -> None:
         "action_units": agent.model.action_width,
         "sensor_units": SENSOR_UNITS if spec.sensors else 0,
         "reach_threshold": float(network.reach_threshold or 0),
+        "temperature": float(network.temperature),
+        "done_bias": float(network.done_bias),
         "reach_units": 0 if network.reach_threshold is None else reach.UNITS,
         "target_box": TARGET_BOX[: spec.columns],
     }

@@ -19,6 +19,7 @@ from tdanet_jax.agent.agent import Agent
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
 from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.decisions import Decisions
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.params import TEST_STEP_LIMITS, make_params
 from tdanet_jax.env.reward import find_parents
@@ -636,7 +637,7 @@ def test_a_checkpoint_of_a_newer_version_is_refused_in_one_line(tmp_path):
         tdanet_jax.load(run)
 
 
-def test_the_threshold_of_reach_can_be_another_one(some_rooms, glove, opinionated_run, tmp_path):
+def test_it_can_decide_otherwise_than_its_run(some_rooms, glove, opinionated_run, tmp_path):
     network = dataclasses.replace(
         TINY.network, odometry=True, triangulation=True, reach_threshold=0.5
     )
@@ -644,13 +645,20 @@ def test_the_threshold_of_reach_can_be_another_one(some_rooms, glove, opinionate
     save_untrained(dataclasses.replace(TINY, network=network), run, some_rooms, glove)
     seen, told = [Detection("mug", 0.4, 0.4, 0.6, 0.6)], []
     for threshold in (None, 0.0, 0.999):
-        agent = tdanet_jax.load(run, reach_threshold=threshold)
+        agent = tdanet_jax.load(run, decisions=Decisions(reach_threshold=threshold))
         decision = agent.act(agent.start(), seen, "mug")[1]
         told.append(decision.probabilities[Action.DONE] > 0)
     assert told == [decision.reach >= 0.5, True, False]
     assert agent.act(agent.start(), seen, "sink")[1].reach is None
     with pytest.raises(ValueError, match=r"--reach-threshold: .* was trained without it"):
-        tdanet_jax.load(opinionated_run, reach_threshold=0.5)
+        tdanet_jax.load(opinionated_run, decisions=Decisions(reach_threshold=0.5))
+    agent = tdanet_jax.load(run, decisions=Decisions(reach_threshold=0.0))
+    plain = agent.act(agent.start(), seen, "mug")[1].probabilities
+    given = Decisions(reach_threshold=0.0, temperature=0.5, done_bias=1.0)
+    other = tdanet_jax.load(run, decisions=given)
+    squared = (plain * np.exp(np.eye(6)[Action.DONE])) ** 2
+    found = other.act(other.start(), seen, "mug")[1].probabilities
+    np.testing.assert_allclose(found, squared / squared.sum(), rtol=1e-4)
 
 
 def test_a_point_of_the_history_is_loaded_by_its_file(weights, glove, tmp_path):

@@ -19,6 +19,7 @@ from tdanet_jax.agent import detectors, numpy_agent
 from tdanet_jax.agent.agent import Agent
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import NetworkConfig, TrainConfig
+from tdanet_jax.decisions import Decisions
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.factory import make_model
@@ -39,6 +40,8 @@ NETWORKS = {
         "robust_triangulation": True,
         "scores": True,
         "reach_threshold": 0.5,
+        "temperature": 0.6,
+        "done_bias": 1.5,
     },
     "rows": {"odometry": True, "rows": "class"},
 }
@@ -115,26 +118,30 @@ def test_if_all_else_is_forbidden_it_is_done_out_of_reach(glove, tmp_path, sampl
         np.testing.assert_array_equal(decision.probabilities, [0, 0, 0, 0, 0, 1])
 
 
-def test_the_threshold_of_reach_can_be_another_one(glove, folder, tmp_path):
+def test_it_can_decide_otherwise_than_its_run(glove, folder, tmp_path):
     theirs = small_agent(glove, **NETWORKS["robust"])
     own = exported(theirs, tmp_path / "out")
     seen = [Detection("mug", 0.4, 0.4, 0.6, 0.6)]
     allowed = []
     for threshold in (None, 0.0, 0.999):
-        agent = numpy_agent.load(own, reach_threshold=threshold)
+        agent = numpy_agent.load(own, decisions=Decisions(reach_threshold=threshold))
         allowed.append(agent.act(agent.start(), seen, "mug")[1].probabilities[Action.DONE] > 0)
     reach = agent.act(agent.start(), seen, "mug")[1].reach
     assert allowed == [reach >= 0.5, True, False]
-    with pytest.raises(ValueError, match=r"reach_threshold 1\.0: must be at least 0 and below 1"):
-        numpy_agent.load(own, reach_threshold=1.0)
-    with pytest.raises(ValueError, match="estimates no reach"):
-        numpy_agent.load(folder, reach_threshold=0.5)
+    other = Decisions(temperature=2.0, done_bias=-1.0)
+    agent = numpy_agent.load(own, decisions=other)
+    assert (agent.meta.temperature, agent.meta.done_bias) == (2.0, -1.0)
+    with pytest.raises(ValueError, match=r"--reach-threshold 1\.0: must be at least 0 and below 1"):
+        numpy_agent.load(own, decisions=Decisions(reach_threshold=1.0))
+    with pytest.raises(ValueError, match=r"--reach-threshold: .* was trained without it"):
+        numpy_agent.load(folder, decisions=Decisions(reach_threshold=0.5))
 
 
-def test_a_folder_of_an_older_version_has_no_estimate_of_reach(folder, tmp_path):
+def test_a_folder_of_an_older_version_decides_as_it_did(folder, tmp_path):
     older = shutil.copytree(folder, tmp_path / "older")
     meta = json.loads((older / "meta.json").read_text())
     assert (meta.pop("reach_threshold"), meta.pop("reach_units")) == (0.0, 0)
+    assert (meta.pop("temperature"), meta.pop("done_bias")) == (1.0, 0.0)
     (older / "meta.json").write_text(json.dumps(meta))
     agent = numpy_agent.load(older)
     seen = [Detection("mug", 0.1, 0.1, 0.3, 0.4)]

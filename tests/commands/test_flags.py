@@ -307,6 +307,8 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--training-rooms": "--training-rooms",
             "--noise": "--noise mix",
             "--reach-threshold": "--reach-threshold 0.5",
+            "--temperature": "--temperature 0.5",
+            "--done-bias": "--done-bias 1",
             "--test-targets": "--test-targets Mug",
             "--seed": "--seed 5",
             "--out": "--out new",
@@ -380,6 +382,8 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--words": "--words words.txt",
             "--synonyms": "--synonyms mine.json",
             "--reach-threshold": "--reach-threshold 0.5",
+            "--temperature": "--temperature 0.5",
+            "--done-bias": "--done-bias 1",
         },
     ),
     "replay": (SHOW, {**ONE_EPISODE, "--shortest": "--shortest"}),
@@ -636,6 +640,7 @@ OF_THE_TASK: dict[str, tuple[Any, str]] = {
     "first_order": (True, "savn"), "precision": ("bfloat16", "tdanet"), "split": ("14/8", "tdanet"),
     "model": ("ssnet", "tdanet"), "noise": ("mix", "tdanet"), "scores": (True, "tdanet"),
     "robust_triangulation": (True, "tdanet"), "reach_threshold": (0.5, "tdanet"),
+    "temperature": (0.5, "tdanet"), "done_bias": (1.0, "tdanet"),
 }  # fmt: skip
 #: Settings with a test of their own below.
 HERE = ("data", "word_vectors", "checkpoint_minutes")

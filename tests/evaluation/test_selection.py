@@ -212,6 +212,7 @@ def test_a_run_is_evaluated_with_another_threshold_of_reach(
         tdanet_jax.evaluate(run, test=test, out=out)
         said = f"Done with a probability of reach of {threshold} or more"
         assert said in (out / "results.md").read_text()
+        assert json.loads((out / "results.json").read_text())["departures"] == test.departures
         records = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
         ended[threshold] = sum(record["actions"][-1] == "Done" for record in records)
     assert ended[0.0] > 10
@@ -222,8 +223,10 @@ def test_a_threshold_needs_an_estimate_of_reach(opinionated_run: Path) -> None:
     test = EvalConfig(reach_threshold=0.5)
     with pytest.raises(ValueError, match=r"--reach-threshold: .*my-run was trained without it"):
         tdanet_jax.evaluate(opinionated_run, test=test)
-    with pytest.raises(ValueError, match="--reach-threshold: needs a checkpoint"):
-        tdanet_jax.evaluate(policy="random", test=test)
+    for values in ({"reach_threshold": 0.5}, {"temperature": 2.0}, {"done_bias": 0.0}):
+        (flag,) = (name.replace("_", "-") for name in values)
+        with pytest.raises(ValueError, match=f"--{flag}: needs a checkpoint"):
+            tdanet_jax.evaluate(policy="random", test=EvalConfig(**values))
     with pytest.raises(ValueError, match="--reach-threshold 1: must be at least 0 and below 1"):
         tdanet_jax.evaluate(opinionated_run, test=EvalConfig(reach_threshold=1))
 

@@ -85,6 +85,33 @@ def test_done_is_forbidden_out_of_view_and_where_the_target_is_probably_out_of_r
     np.testing.assert_array_equal(in_training.reach_logit, out.reach_logit)
 
 
+@pytest.mark.parametrize(("temperature", "done_bias"), [(0.5, 2.0), (3.0, -1.5), (1.0, 0.0)])
+def test_a_trained_network_decides_at_a_temperature_and_with_a_bias_for_done(
+    temperature: float, done_bias: float
+) -> None:
+    """Of the policy that is left where the rule forbids Done, too."""
+    obs = frames(400)
+    own = np.asarray(outputs(PLAIN, obs).logits, np.float64)
+    model = MODEL.clone(temperature=temperature, done_bias=done_bias)
+    ruled = np.asarray(jax.nn.softmax(outputs(MODEL, obs).logits))
+    powers = np.exp((own + done_bias * np.eye(6)[Action.DONE]) / temperature) * (ruled > 0)
+    found = jax.nn.softmax(outputs(model, obs).logits)
+    np.testing.assert_allclose(found, powers / powers.sum(1, keepdims=True), atol=1e-6)
+    in_training = outputs(model, obs, True)
+    np.testing.assert_array_equal(in_training.logits, outputs(PLAIN, obs).logits)
+
+
+def test_what_a_network_remembers_of_its_policy_is_what_it_remembered_in_training() -> None:
+    obs, model = frames(40), MODEL.clone(temperature=0.1, done_bias=5.0)
+    table = actor_critic.prepare(model, WEIGHTS, WORDS)
+    state = actor_critic.initial_state(model, WEIGHTS, 40)
+    after, out, _ = actor_critic.act(model, WEIGHTS, table, state, obs)
+    trained, own, _ = actor_critic.act(model, WEIGHTS, table, state, obs, training=True)
+    np.testing.assert_array_equal(after.prev_action_probs, trained.prev_action_probs)
+    np.testing.assert_allclose(after.prev_action_probs, jax.nn.softmax(own.logits), atol=1e-6)
+    assert (np.asarray(jax.nn.softmax(out.logits)) != np.asarray(after.prev_action_probs)).any()
+
+
 def test_no_name_enters_the_estimate() -> None:
     obs = frames(60)
     renamed = obs.replace(classes=(obs.classes + 1) % 9, target=(obs.target + 1) % 9)

@@ -47,7 +47,7 @@ FAULTS = (
           "agent/test_agent.py"),
     Fault("Done where the target is out of view", "models/reach.py",
           "in_view & (jax", "(jax", "models/test_reach.py"),
-    Fault("Done out of reach", "models/actor_critic.py", "if model.reach_threshold and not training:", "if False:",
+    Fault("Done out of reach", "models/actor_critic.py", "if model.reach_threshold:", "if False:",
           "models/test_reach.py"),
     Fault("Done is forbidden in training", LEARNER, "collections, training=True", "collections",
           "models/test_reach.py"),

@@ -1,0 +1,51 @@
+"""How a trained network decides, in place of what its run says. Imports neither JAX nor NumPy."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+#: For each field of `Decisions`: whether a number can be its value, and how an error says it.
+_RANGES: dict[str, tuple[Callable[[float], bool], str]] = {
+    "reach_threshold": (lambda value: 0 <= value < 1, "be at least 0 and below 1"),
+    "temperature": (lambda value: 0.01 <= value <= 100, "be between 0.01 and 100"),
+    "done_bias": (lambda value: abs(value) <= 100, "be between -100 and 100"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Decisions:
+    """How a trained network decides: settings of `NetworkConfig` on which training does not depend.
+
+    None leaves the run's.
+    """
+
+    reach_threshold: float | None = None
+    """Probability of reach from which Done is allowed, instead of the run's; only for runs that
+    were trained with one. 0 allows Done everywhere."""
+    temperature: float | None = None
+    """Temperature of sampled actions, instead of the run's: the lower, the more often the most
+    probable action is taken."""
+    done_bias: float | None = None
+    """What is added to the logit of Done, instead of the run's: the higher, the earlier the agent
+    says it."""
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The values that are not None, by name."""
+        values = {name: getattr(self, name) for name in _RANGES}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def check(self) -> None:
+        """Raises ValueError, with one line that names the flag, if a value is out of range."""
+        for name, value in self.given.items():
+            holds, wanted = _RANGES[name]
+            is_number = type(value) in (int, float) and math.isfinite(value)
+            if not (is_number and holds(value)):
+                raise ValueError(f"--{name.replace('_', '-')} {value}: must {wanted}")
+
+
+#: The run's own.
+OWN = Decisions()
