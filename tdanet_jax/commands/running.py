@@ -30,10 +30,11 @@ class Command:
     run: tyro.conf.OmitArgPrefixes[TrainConfig]
     preset: Literal["default", "best", "robust", "paper"] = "default"
     """Defaults of the other flags. best: --odometry, --triangulation, --reach-threshold 0.5,
-    --gamma 0.97, --size-noise 0.5, --imitation-weight 0.3 and --extra-targets all, which did best
-    on validation. robust: the same without --reach-threshold, --imitation-weight and
-    --extra-targets, with --robust-triangulation, --scores and --noise, for robots, whose senses
-    err. paper: the reference implementation's hyperparameters and its budget of 6 M episodes."""
+    --temperature 0.3, --done-bias 2, --gamma 0.97, --size-noise 0.5, --imitation-weight 0.3 and
+    --extra-targets all, which did best on validation. robust, for robots, whose senses err:
+    --odometry, --triangulation, --robust-triangulation, --scores, --gamma 0.97, --size-noise 0.5
+    and --noise. paper: the reference implementation's hyperparameters and its budget of 6 M
+    episodes."""
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""
     resume: Path | None = None
