@@ -132,7 +132,7 @@ class NetworkConfig:
     None: not estimated."""
     temperature: float = 1.0
     """Temperature at which actions are sampled after training. Below 1, the most probable ones are
-    taken more often than in training (docs/method.md)."""
+    taken more often than in training. No effect on greedy actions (docs/method.md)."""
     done_bias: float = 0.0
     """Added to the logit of Done after training. Above 0, the agent says it earlier than in
     training (docs/method.md)."""
@@ -152,7 +152,7 @@ class NetworkConfig:
 
     @property
     def decisions(self) -> Decisions:
-        """How the trained network decides."""
+        """How the trained network decides; without a threshold, it does not estimate reach."""
         return Decisions(self.reach_threshold, self.temperature, self.done_bias)
 
     @property
@@ -333,12 +333,13 @@ def with_decisions(config: TrainConfig, decisions: Decisions, run: Path | str) -
     """A run's configuration with other decisions of its trained network.
 
     Raises:
-      ValueError: the run has no estimate of reach, or a value is out of range.
+      ValueError: there is a threshold of reach, but no estimate in the run; or a value is out of
+        range.
     """
     decisions.check()
     if decisions.reach_threshold is not None and config.network.reach_threshold is None:
         raise ValueError(f"--reach-threshold: {run} was trained without it")
-    network = dataclasses.replace(config.network, **decisions.given)
+    network = dataclasses.replace(config.network, **decisions.replaced)
     return dataclasses.replace(config, network=network)
 
 
@@ -464,7 +465,8 @@ BEST = TrainConfig(
 )
 #: For robots: senses that err in training, by up to twice the levels of `mix`, and by up to 3
 #: degrees of heading, which cost more than all else (docs/noise.md). Of BEST, it lacks what has not
-#: been tried under noise yet: the estimate of reach, imitation, extra targets, and how it decides.
+#: been tried with agents that were trained under noise: the estimate of reach, imitation, extra
+#: targets, and other decisions than in training.
 ROBUST = dataclasses.replace(
     BEST,
     extra_targets=None,

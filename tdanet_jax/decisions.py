@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -26,26 +25,25 @@ class Decisions:
     """Probability of reach from which Done is allowed, instead of the run's; only for runs that
     were trained with one. 0 allows Done everywhere."""
     temperature: float | None = None
-    """Temperature of sampled actions, instead of the run's: the lower, the more often the most
-    probable action is taken."""
+    """Temperature at which actions are sampled, instead of the run's: the lower, the more often the
+    most probable one is taken. No effect on greedy actions."""
     done_bias: float | None = None
     """What is added to the logit of Done, instead of the run's: the higher, the earlier the agent
     says it."""
 
     @property
-    def given(self) -> dict[str, Any]:
-        """The values that are not None, by name."""
+    def replaced(self) -> dict[str, Any]:
+        """The values that replace the run's, by name."""
         values = {name: getattr(self, name) for name in _RANGES}
         return {name: value for name, value in values.items() if value is not None}
 
     def check(self) -> None:
         """Raises ValueError, with one line that names the flag, if a value is out of range."""
-        for name, value in self.given.items():
+        for name, value in self.replaced.items():
             holds, wanted = _RANGES[name]
-            is_number = type(value) in (int, float) and math.isfinite(value)
-            if not (is_number and holds(value)):
+            if not (type(value) in (int, float) and holds(value)):
                 raise ValueError(f"--{name.replace('_', '-')} {value}: must {wanted}")
 
 
 #: The run's own.
-OWN = Decisions()
+OWN_DECISIONS = Decisions()

@@ -9,14 +9,14 @@ from typing import Any
 
 from tdanet_jax import sense_noise
 from tdanet_jax.config import TrainConfig, find_word_vectors, fits, with_decisions
-from tdanet_jax.decisions import Decisions
+from tdanet_jax.decisions import OWN_DECISIONS, Decisions
 from tdanet_jax.sense_noise import SenseNoise
 from tdanet_jax.splits import OPEN
 from tdanet_jax.targets import canonical, known_classes, naming, parse
 
 
 @dataclasses.dataclass(frozen=True)
-class EvalConfig(Decisions):
+class EvalConfig:
     """Where an evaluation departs from the run's own task."""
 
     data: str | None = None
@@ -34,19 +34,21 @@ class EvalConfig(Decisions):
     episodes: int | None = None
     """Play at most this many episodes of each list, evenly spaced, for a quick look."""
     scenes: tuple[str, ...] = ()
-    """Play only the test episodes in these rooms, such as FloorPlan228."""
+    """Play only the episodes in these rooms, such as FloorPlan228."""
     targets: tuple[str, ...] = ()
-    """Play only the test episodes with these targets, such as Laptop."""
+    """Play only the episodes with these targets, such as Laptop."""
     training_rooms: bool = False
-    """Play as many episodes in the training rooms instead of the test rooms, to see what it costs
-    an agent that rooms are new to it."""
+    """Play episodes in the split's training rooms instead of its test rooms, drawn in the same way.
+    The difference shows roughly what new rooms cost."""
     noise: str | None = None
     """Senses that err: detector, wheels, mix, or levels such as misses=0.2,jitter=0.1
     (docs/noise.md). The command also takes sweep: five levels of each kind of noise."""
+    decisions: Decisions = OWN_DECISIONS
+    """How the agent decides, instead of as its run says."""
 
     def check(self) -> None:
         """Raises ValueError, with one line that names the flag, if a value is out of range."""
-        super().check()
+        self.decisions.check()
         for name, value in (("step-limit", self.step_limit), ("episodes", self.episodes)):
             if value is not None and (not fits(value, int) or value < 1):
                 raise ValueError(f"--{name} {value}: must be a positive integer")
@@ -68,7 +70,7 @@ class EvalConfig(Decisions):
         values |= {name: list(getattr(self, name)) for name in ("scenes", "targets")}
         if self.senses.any:
             values["noise"] = str(self.senses)
-        return {name: value for name, value in values.items() if value} | self.given
+        return {name: value for name, value in values.items() if value} | self.decisions.replaced
 
     def locate(self, config: TrainConfig, run: Path | str) -> TrainConfig:
         """A run's configuration as it is evaluated, with its files and no rooms to train in alone.
@@ -93,7 +95,7 @@ class EvalConfig(Decisions):
                 )
         config = self.with_targets(dataclasses.replace(config, data=data))
         words = find_word_vectors(config, run, self.word_vectors)
-        config = with_decisions(config.in_rooms_alone(), self, run)
+        config = with_decisions(config.in_rooms_alone(), self.decisions, run)
         return dataclasses.replace(config, word_vectors=words)
 
     def with_targets(self, config: TrainConfig) -> TrainConfig:
@@ -113,6 +115,11 @@ class EvalConfig(Decisions):
         return dataclasses.replace(config, targets=canonical(self.test_targets))
 
 
+def rooms_played(departures: Mapping[str, Any] | None) -> str:
+    """In which rooms the episodes lie, in words, by `EvalConfig.departures`."""
+    return "training rooms" if (departures or {}).get("training_rooms") else "test rooms"
+
+
 def describe_departures(departures: Mapping[str, Any]) -> str:
     """`EvalConfig.departures` in words, for reports."""
     texts = {
@@ -123,7 +130,7 @@ def describe_departures(departures: Mapping[str, Any]) -> str:
         "targets": "only for {}",
         "noise": "senses that err, {}",
         "reach_threshold": "Done with a probability of reach of {} or more",
-        "temperature": "actions sampled at temperature {}",
+        "temperature": "a temperature of {}",
         "done_bias": "{} added to the logit of Done",
     }
     parts = [

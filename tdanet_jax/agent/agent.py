@@ -21,7 +21,7 @@ from tdanet_jax import words
 from tdanet_jax.agent.base import BaseAgent, Decision, sigmoid, softmax, without
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors, with_decisions
-from tdanet_jax.decisions import OWN, Decisions
+from tdanet_jax.decisions import OWN_DECISIONS, Decisions
 from tdanet_jax.env.types import Observation
 from tdanet_jax.io.bundled_agents import find_run, folder_of
 from tdanet_jax.labels import Synonyms
@@ -125,7 +125,7 @@ class Agent(BaseAgent):
           detections: the objects in view, in any order.
           target: what to look for, in English. Detections of it are those whose label means the
             same (`labels`): "tv", "TVs" and "Television_2" do.
-          key: samples the action, as in training; None takes the most probable one.
+          key: samples the action, at the agent's temperature; None takes the most probable one.
           blocked: whether the previous action failed to move the agent (AI2-THOR's
             `lastActionSuccess` was False). Networks with sensors need it after a MoveAhead, and
             after no other action.
@@ -339,7 +339,7 @@ def load(
     grid: PoseGrid = ITHOR,
     word_vectors: Path | str | None = None,
     synonyms: Synonyms | Path | str | None = None,
-    decisions: Decisions = OWN,
+    decisions: Decisions = OWN_DECISIONS,
 ) -> Agent:
     """The agent of a run's newest checkpoint, or of a point of its history. Needs no rooms.
 

@@ -157,7 +157,7 @@ def play(
         agent on the grid, at a multiple of its turn.
       target: what to look for, in English; for `success`, a label that means an object type, such
         as "laptop".
-      key: samples the actions, as in training; None takes the most probable ones.
+      key: samples the actions, at the agent's temperature; None takes the most probable ones.
       step_limit: actions after which the episode ends without success. Test episodes have 100, and
         200 in living rooms.
 

@@ -23,7 +23,9 @@ class Decision(NamedTuple):
     """What the agent does, and why."""
 
     action: Action
-    probabilities: np.ndarray  # [6], in the order of `Action`; 0 for what is forbidden
+    #: [6], in the order of `Action`, with which actions are sampled: after temperature, bias for
+    #: Done and the rule on reach; 0 for what is forbidden.
+    probabilities: np.ndarray
     value: float  # expected discounted return
     attention: np.ndarray | None  # [n], weight of each detection; None if the model has none
     reach: float | None = None  # probability of the target in view being within 1.5 m, if estimated

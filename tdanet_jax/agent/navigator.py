@@ -46,7 +46,7 @@ class NavigatorConfig:
     max_steps: int = 200
     """Actions after which an episode ends without success."""
     seed: int | None = None
-    """Seed of sampled actions, as in training; None takes the most probable ones."""
+    """Seed of sampled actions, at the agent's temperature; None takes the most probable ones."""
 
     def check(self) -> None:
         """Raises ValueError, with one line that names the field, if a value is out of range."""

@@ -20,7 +20,7 @@ import numpy as np
 from tdanet_jax import words
 from tdanet_jax.agent.base import BaseAgent, Decision, sigmoid, softmax, without
 from tdanet_jax.agent.detection import Detection
-from tdanet_jax.decisions import OWN, Decisions
+from tdanet_jax.decisions import OWN_DECISIONS, Decisions
 from tdanet_jax.io.untrusted import FileError, npz
 from tdanet_jax.labels import Synonyms
 from tdanet_jax.observation_spec import TRACKING, ObservationSpec
@@ -68,6 +68,8 @@ _KINDS: dict[str, type] = {
     "width": int, "hidden": int, "action_units": int, "sensor_units": int, "target_box": list,
     "reach_threshold": float, "reach_units": int, "temperature": float, "done_bias": float,
 }  # fmt: skip
+#: The fields of `Decisions`.
+_DECISIONS = ("reach_threshold", "temperature", "done_bias")
 #: Fields that folders of older versions lack.
 _DEFAULTS = {"reach_threshold": 0.0, "reach_units": 0, "temperature": 1.0, "done_bias": 0.0}
 
@@ -77,7 +79,7 @@ class AgentState(NamedTuple):
 
     hidden: np.ndarray  # [H] float32, of the LSTM
     cell: np.ndarray  # [H] float32
-    probabilities: np.ndarray  # [6] float32, of the previous step's actions; 0 at the start
+    probabilities: np.ndarray  # [6] float32, of its own policy one step before; 0 at first
     action: int  # the previous action; 6 at the start
     sensors: numpy_sensors.States  # before that action
     target: int  # row of what it looked for in the previous step; -1 at the start
@@ -240,7 +242,7 @@ def load(
     folder: Path | str,
     grid: PoseGrid = ITHOR,
     synonyms: Synonyms | Path | str | None = None,
-    decisions: Decisions = OWN,
+    decisions: Decisions = OWN_DECISIONS,
 ) -> NumPyAgent:
     """An exported agent.
 
@@ -259,7 +261,7 @@ def load(
     decisions.check()
     if decisions.reach_threshold is not None and not meta.reach_units:
         raise ValueError(f"--reach-threshold: {folder} was trained without it")
-    meta = dataclasses.replace(meta, **decisions.given)
+    meta = dataclasses.replace(meta, **decisions.replaced)
     vectors = words.load_word_vectors(folder / WORDS_FILE)
     weights = npz.read(folder / MODEL_FILE)
     expected = shapes(meta, vectors.vectors.shape[1])
@@ -318,6 +320,10 @@ def _read_meta(path: Path) -> Meta:
         raise FileError(path, f"no sensor is called {min(unknown)}")
     if values["reach_units"] and not {*TRACKING} & {*values["sensors"]}:
         raise FileError(path, "reach_units: needs triangulation among the sensors")
+    try:
+        Decisions(*(values[name] for name in _DECISIONS)).check()
+    except ValueError as error:
+        raise FileError(path, error) from None
     lists = {name: tuple(values[name]) for name, kind in _KINDS.items() if kind is list}
     return Meta(**{name: values[name] for name in _KINDS} | lists)
 

@@ -175,7 +175,7 @@ def scaling(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def evaluated_curves(curves: Sequence[Curve], title: str, path: Path) -> None:
-    """SR and SPL in the test rooms against training episodes, from evaluated histories.
+    """SR and SPL against training episodes, from evaluated histories.
 
     Seen targets are solid lines, unseen ones dashed; a band is one deviation over seeds.
     """
@@ -186,7 +186,7 @@ def evaluated_curves(curves: Sequence[Curve], title: str, path: Path) -> None:
             style = PALETTE[i % len(PALETTE)], MARKERS[i % len(MARKERS)]
             for group in GROUPS:
                 _draw_curve(axis, curve, group, measure, *style)
-        axis.set(ylabel=f"{measure}, per cent, test rooms", ylim=(0, None), xlim=(0, None))
+        axis.set(ylabel=f"{measure}, per cent", ylim=(0, None), xlim=(0, None))
         _episodes_along(axis)
     figure.suptitle(_in_lines(title))
     handles, labels = axes[0].get_legend_handles_labels()

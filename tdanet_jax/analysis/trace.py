@@ -19,7 +19,8 @@ import numpy as np
 from tdanet_jax import config as configs
 from tdanet_jax.agent import agent
 from tdanet_jax.analysis import attention
-from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors
+from tdanet_jax.config import CONFIG_FILE, TrainConfig, find_word_vectors, with_decisions
+from tdanet_jax.decisions import OWN_DECISIONS, Decisions
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import EnvParams, EnvState
 from tdanet_jax.evaluation import policies, rollout
@@ -77,6 +78,7 @@ def load_player(
     rooms: Rooms,
     greedy: bool = False,
     word_vectors: Path | str | None = None,
+    decisions: Decisions = OWN_DECISIONS,
 ) -> Player:
     """The agent of a training run, or of a point of its history, on the given rooms.
 
@@ -86,16 +88,19 @@ def load_player(
       rooms: where it plays.
       greedy: take the most probable action instead of sampling one.
       word_vectors: file of word vectors in place of the run's copy.
+      decisions: how the agent decides, in place of the run's settings.
 
     Returns:
       A player with the name of the run's folder, or of the point.
 
     Raises:
       ValueError: the folder holds no run, its checkpoint cannot be read, the network needs feature
-        maps that the rooms do not have, or it knows classes by index and the rooms have others.
+        maps that the rooms do not have, it knows classes by index and the rooms have others, or
+        `decisions` do not fit the run.
     """
     run = find_run(run)
     config, weights, classes = agent.read(run)
+    config = with_decisions(config, decisions, run)
     config = _in_these_rooms(run, config, word_vectors)
     task = task_in(rooms, config)
     task.check_known(run, classes.names)

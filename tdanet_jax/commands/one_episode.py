@@ -13,6 +13,7 @@ import tyro
 from tdanet_jax import config as configs
 from tdanet_jax.commands.console import RunPath, console, fail, load_rooms
 from tdanet_jax.config import CONFIG_FILE
+from tdanet_jax.decisions import OWN_DECISIONS, Decisions
 from tdanet_jax.eval_config import EvalConfig
 from tdanet_jax.io.bundled_agents import folder_of
 from tdanet_jax.poses import TURNS
@@ -45,6 +46,8 @@ class Choice:
     """File of word vectors, instead of the copies that the runs hold of their own."""
     policy: Literal["sample", "greedy"] = "sample"
     """Whether actions are sampled or the most probable ones are taken."""
+    decisions: Decisions = OWN_DECISIONS
+    """How the agents decide, instead of as their runs say."""
 
     @property
     def given(self) -> bool:
@@ -72,6 +75,7 @@ def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
     if not runs:
         fail("give --checkpoint, the folder of a run")
     configs.check_seed(choice.seed)
+    choice.decisions.check()
     if choice.start is not None:
         start = f"--start {' '.join(map(str, choice.start))}"
         if not all(map(math.isfinite, choice.start)):
@@ -112,7 +116,7 @@ def load_players(choice: Choice, runs: Sequence[Path], rooms: Rooms) -> list[Pla
     greedy, words = choice.policy == "greedy", choice.word_vectors
     players = []
     for run in runs:
-        players.append(trace.load_player(run, rooms, greedy, words))
+        players.append(trace.load_player(run, rooms, greedy, words, choice.decisions))
         rooms = dataclasses.replace(rooms, tables=players[-1].task.tables)
     names = [player.name for player in players]
     return [

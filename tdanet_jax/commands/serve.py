@@ -25,7 +25,7 @@ import tyro
 from tdanet_jax.agent.camera import Camera
 from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
 from tdanet_jax.commands.console import RunPath, one_line_errors, parse
-from tdanet_jax.decisions import OWN, Decisions
+from tdanet_jax.decisions import OWN_DECISIONS, Decisions
 
 #: Bytes of a line.
 LONGEST = 1 << 20
@@ -53,7 +53,7 @@ class Command:
     """File of further words, in GloVe's text format: a word and its numbers on each line."""
     synonyms: Path | None = None
     """JSON file of other names: {"Mug": ["beaker"]}."""
-    decisions: tyro.conf.OmitArgPrefixes[Decisions] = OWN
+    decisions: tyro.conf.OmitArgPrefixes[Decisions] = OWN_DECISIONS
 
     @property
     def camera(self) -> Camera:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tdanet_jax.config import TrainConfig
-from tdanet_jax.eval_config import describe_departures
+from tdanet_jax.eval_config import describe_departures, rooms_played
 from tdanet_jax.evaluation import metrics, paper
 from tdanet_jax.evaluation.metrics import BUCKETS
 from tdanet_jax.io.escaping import in_markdown
@@ -229,12 +229,12 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
       results: as `saved_networks.Evaluated.results` gives them.
       runs: a short name for each; points of one run, which are not averaged, share one.
     """
+    departures = results[0].get("departures") if results else None  # all are played alike
     lines = [
         f"# {in_markdown(title)}",
         "",
-        "SR and SPL in percent, test rooms. " + metrics.COLLISION_FREE,
+        f"SR and SPL in percent, {rooms_played(departures)}. {metrics.COLLISION_FREE}",
     ]
-    departures = results[0].get("departures") if results else None  # all are played alike
     if departures:
         lines += ["", f"**{in_markdown(describe_departures(departures))}.**"]
     for split in dict.fromkeys(result["split"] for result in results):

@@ -116,9 +116,21 @@ def draw_split(tables: SceneTables, split: Split) -> dict[str, Episodes]:
 
 
 def in_training_rooms(tables: SceneTables, split: Split) -> dict[str, Episodes]:
-    """Episodes in a split's training rooms, by group, drawn as its test episodes are."""
+    """Episodes in a split's training rooms, by group, drawn as its test episodes are.
+
+    Raises:
+      ValueError: none can be drawn.
+    """
     lists = draw_split(tables, dataclasses.replace(split, eval_scenes=split.train_scenes))
-    return {group: episodes for group, episodes in lists.items() if len(episodes)}
+    return _found(lists, split, "training rooms")
+
+
+def _found(lists: dict[str, Episodes], split: Split, where: str) -> dict[str, Episodes]:
+    """The lists with an episode; one of seen targets must be among them."""
+    lists = {group: episodes for group, episodes in lists.items() if len(episodes)}
+    if "seen" not in lists:
+        raise ValueError(f"no seen target of split {split.name} can be reached in its {where}")
+    return lists
 
 
 def build_asset(tables: SceneTables, out_dir: Path | str) -> Path:
@@ -156,10 +168,7 @@ def load(tables: SceneTables, split: Split, extras: Extras | None = None) -> dic
     if extras is None:
         return _committed(tables, split) or draw_split(tables, split)
     lists = draw_split(tables, split) | published(tables, split, extras.episodes)
-    lists = {group: episodes for group, episodes in lists.items() if len(episodes)}
-    if "seen" not in lists:
-        raise ValueError(f"no seen target of split {split.name} can be reached in its test rooms")
-    return lists
+    return _found(lists, split, "test rooms")
 
 
 def published(

@@ -67,11 +67,12 @@ def choose(
     """
     scenes = {group: _scene_names(chosen, tables) for group, chosen in lists.items()}
     targets = {group: np.array(tables.targets)[one.target] for group, one in lists.items()}
-    wanted_scenes = find_names("scenes", test.scenes, np.unique([*_values(scenes)]))
+    kind = "episode in a training room" if test.training_rooms else "test episode"
+    wanted_scenes = find_names("scenes", test.scenes, np.unique([*_values(scenes)]), kind)
     played = tuple(map(str, np.unique([*_values(targets)])))
     meant = [labels_of(played).find(label) for label in test.targets]
     asked = [m if m in played else label for m, label in zip(meant, test.targets, strict=True)]
-    wanted_targets = find_names("targets", asked, played)
+    wanted_targets = find_names("targets", asked, played, kind)
     out = {}
     for group, one in lists.items():
         kept = np.isin(scenes[group], wanted_scenes) & np.isin(targets[group], wanted_targets)
@@ -81,12 +82,20 @@ def choose(
         if len(found):
             out[group] = Episodes(one.pose[found], one.target[found])
     if not out:
-        raise ValueError("--scenes, --targets: no test episode has one of these targets there")
+        raise ValueError(f"--scenes, --targets: no {kind} has one of these targets there")
     return out
 
 
-def find_names(flag: str, given: Collection[str], known: Iterable[str]) -> list[str]:
+def find_names(
+    flag: str, given: Collection[str], known: Iterable[str], kind: str = "test episode"
+) -> list[str]:
     """The names that a flag gives; all that are known if it gives none.
+
+    Args:
+      flag: its name.
+      given: its names.
+      known: those that occur.
+      kind: what they occur in, for errors.
 
     Raises:
       ValueError: a name is not known; suggests a similar one, or lists them all.
@@ -101,7 +110,7 @@ def find_names(flag: str, given: Collection[str], known: Iterable[str]) -> list[
                 hint = "separate names with spaces"
             if flag == "scenes" and os.path.isfile(name):  # of Path, a long name is an error
                 hint = "rooms of your own are imported (tdanet scenes import) and given with --data"
-            raise ValueError(f"--{flag} {name}: in no test episode; {hint}")
+            raise ValueError(f"--{flag} {name}: in no {kind}; {hint}")
     return list(given) or names
 
 

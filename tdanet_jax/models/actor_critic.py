@@ -36,7 +36,7 @@ class RecurrentState(struct.PyTreeNode):
     """What a network carries from step to step in B environments."""
 
     carry: Any  # of the LSTM: hidden and cell, each [B, H]; adaptive networks carry more
-    prev_action_probs: jax.Array  # [B, 6], action probabilities of the previous step; 0 at first
+    prev_action_probs: jax.Array  # [B, 6], of the network's own policy one step before; 0 at first
     is_first: jax.Array  # [B] bool, the episode has just begun
 
     def restarted(self, done: jax.Array) -> RecurrentState:
@@ -213,7 +213,7 @@ def act(
     Args:
       collections: Flax collections to return: `ACTIVATIONS` while training, "intermediates" for the
         attention, its logits and the Siamese difference.
-      training: the policy is the network's own; after training, `decided` changes it.
+      training: the policy is the network's own; after training, `decision_logits` changes it.
 
     Returns:
       The state after the step, policy and value, and the collections by name. The state remembers
@@ -223,11 +223,11 @@ def act(
     (carry, out), kept = model.apply({"params": weights}, *inputs, mutable=list(collections))
     after = RecurrentState(carry, jax.nn.softmax(out.logits), jnp.zeros_like(state.is_first))
     if not training:
-        out = out._replace(logits=decided(model, out, obs.target_in_view))
+        out = out._replace(logits=decision_logits(model, out, obs.target_in_view))
     return after, out, kept
 
 
-def decided(model: ActorCritic, out: Output, in_view: jax.Array) -> jax.Array:
+def decision_logits(model: ActorCritic, out: Output, in_view: jax.Array) -> jax.Array:
     """The logits [..., 6] with which a trained network acts.
 
     Args:

@@ -10,7 +10,7 @@ from typing import Any
 
 from tdanet_jax.analysis import figures
 from tdanet_jax.config import TrainConfig
-from tdanet_jax.eval_config import OWN_TASK, EvalConfig
+from tdanet_jax.eval_config import OWN_TASK, EvalConfig, rooms_played
 from tdanet_jax.evaluation import comparison, policies, report, rollout, saved_networks, selection
 from tdanet_jax.evaluation.policies import MakePolicy, Policy
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
@@ -108,8 +108,8 @@ def _evaluate_policy(
     folder: Path | None,
 ) -> dict[str, Any]:
     """A policy without a checkpoint."""
-    if given := [*test.given]:
-        raise ValueError(f"--{given[0].replace('_', '-')}: needs a checkpoint, whose agent decides")
+    if replaced := [name.replace("_", "-") for name in test.decisions.replaced]:
+        raise ValueError(f"--{replaced[0]}: is for trained agents, and needs a checkpoint")
     name = policy if isinstance(policy, str) else "custom"
     if isinstance(policy, str):
         if policy not in UNTRAINED:
@@ -154,7 +154,7 @@ def _write(
             for run, name in names.items()
         ]
         picture = folder / "learning_curve.png"
-        where = "Training rooms" if networks[0].test.training_rooms else "Test rooms"
+        where = rooms_played(networks[0].test.departures).capitalize()
         figures.evaluated_curves(curves, f"{where}, while training", picture)
     files.write_text(folder / "evaluations.json", json.dumps(results, indent=2) + "\n")
 

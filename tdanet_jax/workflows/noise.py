@@ -15,7 +15,7 @@ from typing import Any
 
 from tdanet_jax import sense_noise
 from tdanet_jax.analysis import figures
-from tdanet_jax.eval_config import OWN_TASK, EvalConfig, describe_departures
+from tdanet_jax.eval_config import OWN_TASK, EvalConfig, describe_departures, rooms_played
 from tdanet_jax.evaluation import metrics, report, results_file, saved_networks
 from tdanet_jax.evaluation.metrics import MEASURES
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
@@ -90,7 +90,8 @@ def evaluate_noise(
         ordered = [rows[i] for i in range(len(levels))]
         if folder is not None:
             files.write_text(folder / "noise.md", markdown(ordered))
-            figures.noise(ordered, "Senses that err, test rooms", folder / "noise.png")
+            where = rooms_played(ordered[0]["departures"])
+            figures.noise(ordered, f"Senses that err, {where}", folder / "noise.png")
     return ordered
 
 

@@ -77,12 +77,23 @@ class Row:
     @property
     def agent(self) -> str:
         """What seeds of one configuration share: its model and its flags, as they are typed."""
+        return " ".join(self.flags)
+
+    @property
+    def flags(self) -> tuple[str, ...]:
+        """The model, then each flag with its value.
+
+        They are relative to the preset from which fewest differ, of those with the same senses if
+        there are any.
+        """
         if self.config is None:
-            return self.name if self.results["model"] == CUSTOM else self.results["model"]
+            return (self.name if self.results["model"] == CUSTOM else self.results["model"],)
         differing = {name: _differing(self.config, preset) for name, preset in PRESETS.items()}
-        preset = min(PRESETS, key=lambda name: len(differing[name]))
+        spec = self.config.network.spec
+        alike = [name for name, preset in PRESETS.items() if preset.network.spec == spec]
+        preset = min(alike or PRESETS, key=lambda name: len(differing[name]))
         chosen = [] if preset == "default" else [f"--preset {preset}"]
-        return " ".join([self.config.model, *chosen, *differing[preset]])
+        return self.config.model, *chosen, *differing[preset]
 
     @property
     def senses(self) -> list[str] | None:

@@ -13,7 +13,7 @@ import hashlib
 import json
 import re
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -105,17 +105,28 @@ def of_rows(rows: Iterable[Row]) -> list[str]:
 
 
 def of_agents(rows: Iterable[Row]) -> list[str]:
-    """A table of the agents of rows, in their order: SR and SPL of all episodes."""
-    shown = [
-        (_without_senses(_of_agent(agent, seeds)), comparison.summary([r.results for r in seeds]))
-        for agent, seeds in _by_agent(rows).items()
-    ]
-    heads, measures = _without_senses(_HEADS), comparison.MEASURES
-    return ["", *comparison.table(heads, shown, buckets=("L>=1",), measures=measures), ""]
+    """A table of the agents of rows, in their order: SR and SPL of all episodes.
+
+    The flags that all of them share are given once, before the table.
+    """
+    agents = _by_agent(rows)
+    common = [flag for flag in next(iter(agents.values()))[0].flags if _all_have(agents, flag)]
+    shared = len(agents) > 1 and len(common) > 1
+    shown = []
+    for agent, (first, *others) in agents.items():
+        own = " ".join(flag for flag in first.flags if flag not in common) if shared else agent
+        _, _, *cells = _of_agent(agent, [first, *others])
+        name = _code(own) if own else "as it is"
+        shown.append(((name, *cells), comparison.summary([r.results for r in (first, *others)])))
+    table = comparison.table(
+        (_HEADS[0], *_HEADS[2:]), shown, buckets=("L>=1",), measures=comparison.MEASURES
+    )
+    said = [f"Each is {_code(' '.join(common))} with what its row says.", ""] if shared else []
+    return ["", *said, *table, ""]
 
 
-def _without_senses(cells: Sequence[str]) -> Sequence[str]:
-    return (cells[0], *cells[2:])
+def _all_have(agents: Mapping[str, Sequence[Row]], flag: str) -> bool:
+    return all(flag in seeds[0].flags for seeds in agents.values())
 
 
 def _by_agent(rows: Iterable[Row]) -> dict[str, list[Row]]:

@@ -144,8 +144,13 @@ def test_a_folder_of_an_older_version_decides_as_it_did(folder, tmp_path):
     assert (meta.pop("temperature"), meta.pop("done_bias")) == (1.0, 0.0)
     (older / "meta.json").write_text(json.dumps(meta))
     agent = numpy_agent.load(older)
+    assert agent.meta == numpy_agent.load(folder).meta
     seen = [Detection("mug", 0.1, 0.1, 0.3, 0.4)]
     assert agent.act(agent.start(), seen, "mug")[1].reach is None
+    for value in (0.0, float("nan")):
+        (older / "meta.json").write_text(json.dumps(meta | {"temperature": value}))
+        with pytest.raises(ValueError, match=r"meta\.json: --temperature .*: must be between"):
+            numpy_agent.load(older)
 
 
 def test_a_navigator_runs_it(folder):

@@ -274,6 +274,9 @@ ONE_EPISODE = {
     "--data": "--data rooms.npz",
     "--word-vectors": "--word-vectors words.txt",
     "--policy": "--policy greedy",
+    "--reach-threshold": "--reach-threshold 0.5",
+    "--temperature": "--temperature 0.5",
+    "--done-bias": "--done-bias 1",
     "--out": "--out other/a.png",
 }
 SHOW = "--checkpoint run --scene FloorPlan1 --target Mug"
@@ -394,7 +397,16 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
         "--checkpoint run",
         {
             flag: ONE_EPISODE[flag]
-            for flag in ("--seed", "--data", "--word-vectors", "--policy", "--out")
+            for flag in (
+                "--seed",
+                "--data",
+                "--word-vectors",
+                "--policy",
+                "--reach-threshold",
+                "--temperature",
+                "--done-bias",
+                "--out",
+            )
         },
     ),
     "failures": (

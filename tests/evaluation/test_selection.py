@@ -16,6 +16,7 @@ import tdanet_jax
 from tdanet_jax import EvalConfig
 from tdanet_jax.commands import evaluate
 from tdanet_jax.config import TrainConfig
+from tdanet_jax.decisions import Decisions
 from tdanet_jax.env.params import TEST_STEP_LIMITS
 from tdanet_jax.eval_config import OWN_TASK, describe_departures
 from tdanet_jax.evaluation import comparison, episodes, selection
@@ -97,6 +98,10 @@ def test_rooms_and_targets_are_chosen_by_name(
         ),
         ({"scenes": ("a" * 9999,)}, f"--scenes {'a' * 9999}: in no test episode; there are"),
         ({"scenes": ("FloorPlan1",)}, "--scenes FloorPlan1: in no test episode; did you mean"),
+        (
+            {"scenes": ("FloorPlan1",), "training_rooms": True},
+            "--scenes FloorPlan1: in no episode in a training room; ",  # of these lists
+        ),
         (
             {"scenes": ("FloorPlan228",), "targets": ("Toaster",)},
             "--scenes, --targets: no test episode has one of these targets there",
@@ -208,7 +213,9 @@ def test_a_run_is_evaluated_with_another_threshold_of_reach(
     ended = {}
     for threshold in (0.0, 0.999):
         out = tmp_path / str(threshold)
-        test = EvalConfig(episodes=30, step_limit=20, reach_threshold=threshold)
+        test = EvalConfig(
+            episodes=30, step_limit=20, decisions=Decisions(reach_threshold=threshold)
+        )
         tdanet_jax.evaluate(run, test=test, out=out)
         said = f"Done with a probability of reach of {threshold} or more"
         assert said in (out / "results.md").read_text()
@@ -217,18 +224,34 @@ def test_a_run_is_evaluated_with_another_threshold_of_reach(
         ended[threshold] = sum(record["actions"][-1] == "Done" for record in records)
     assert ended[0.0] > 10
     assert ended[0.999] == 0
+    decisions = Decisions(reach_threshold=0.0, done_bias=-100.0)
+    tdanet_jax.evaluate(
+        run, test=EvalConfig(episodes=30, decisions=decisions), out=tmp_path / "biased"
+    )
+    lines = (tmp_path / "biased" / "episodes.jsonl").read_text().splitlines()
+    assert not any(json.loads(line)["actions"][-1] == "Done" for line in lines)
 
 
 def test_a_threshold_needs_an_estimate_of_reach(opinionated_run: Path) -> None:
-    test = EvalConfig(reach_threshold=0.5)
+    test = EvalConfig(decisions=Decisions(reach_threshold=0.5))
     with pytest.raises(ValueError, match=r"--reach-threshold: .*my-run was trained without it"):
         tdanet_jax.evaluate(opinionated_run, test=test)
-    for values in ({"reach_threshold": 0.5}, {"temperature": 2.0}, {"done_bias": 0.0}):
-        (flag,) = (name.replace("_", "-") for name in values)
-        with pytest.raises(ValueError, match=f"--{flag}: needs a checkpoint"):
-            tdanet_jax.evaluate(policy="random", test=EvalConfig(**values))
+    for name in ("reach_threshold", "temperature", "done_bias"):
+        flag, test = name.replace("_", "-"), EvalConfig(decisions=Decisions(**{name: 0.5}))
+        with pytest.raises(ValueError, match=f"--{flag}: is for trained agents"):
+            tdanet_jax.evaluate(policy="random", test=test)
     with pytest.raises(ValueError, match="--reach-threshold 1: must be at least 0 and below 1"):
-        tdanet_jax.evaluate(opinionated_run, test=EvalConfig(reach_threshold=1))
+        tdanet_jax.evaluate(
+            opinionated_run, test=EvalConfig(decisions=Decisions(reach_threshold=1))
+        )
+
+
+def test_every_departure_is_said_in_words() -> None:
+    test = EvalConfig(training_rooms=True, decisions=Decisions(0.7, 0.5, 0.0))
+    assert describe_departures(test.departures) == (
+        "Not the official test: in the training rooms; Done with a probability of reach of 0.7 or "
+        "more; a temperature of 0.5; 0.0 added to the logit of Done"
+    )
 
 
 def test_a_page_on_several_networks_says_so_too() -> None:
@@ -242,3 +265,8 @@ def test_a_page_on_several_networks_says_so_too() -> None:
     page = comparison.markdown("2 checkpoints", [result, result], ["a", "b"])
     assert f"**{describe_departures(departures)}.**" in page
     assert "(paper)" not in page
+    assert "SR and SPL in percent, test rooms." in page
+    result["departures"] = EvalConfig(training_rooms=True).departures
+    page = comparison.markdown("2 checkpoints", [result, result], ["a", "b"])
+    assert "SR and SPL in percent, training rooms." in page
+    assert "test rooms" not in page

@@ -332,6 +332,29 @@ def test_runs_for_choosing_settings_stand_apart(of_validation: Path, tmp_path: P
         )
 
 
+def test_a_table_of_agents_gives_the_flags_that_all_share_once() -> None:
+    first = scoreboard.read(RESULTS / "18-4-best-0")
+    configs = [
+        dataclasses.replace(BEST, steps=9, **own)
+        for own in ({"variants": 4}, {}, {"targets": "Mug,Bed", "generated": 10}, {})
+    ]
+    rows = [dataclasses.replace(first, config=config) for config in configs]
+    _, said, _, *lines = scoreboard_page.of_agents(rows)
+    assert said == "Each is <code>tdanet --preset best --steps 9</code> with what its row says."
+    assert [line.split(" |")[0] for line in lines[2:-1]] == [
+        "| <code>--variants 4</code>", "| as it is",
+        "| <code>--targets Mug,Bed --generated 10</code>",
+    ]  # fmt: skip
+    assert [line.split(" |")[1] for line in lines[2:-1]] == [" 0", " 0, 0", " 0"]
+    _, *alone = scoreboard_page.of_agents(rows[:1])
+    assert alone[2].startswith("| <code>tdanet --preset best --steps 9 --variants 4</code> | 0 |")
+    random = scoreboard.read(RESULTS / "18-4-random")
+    apart = scoreboard_page.of_agents([rows[1], random])
+    assert [line.split(" |")[0] for line in apart[3:-1]] == [
+        "| <code>tdanet --preset best --steps 9</code>", "| <code>random</code>"
+    ]  # fmt: skip
+
+
 def test_a_run_for_other_targets_has_the_results_of_its_evaluation(
     of_validation: Path, tmp_path: Path
 ) -> None:
@@ -404,7 +427,18 @@ def test_an_agent_is_called_by_its_flags() -> None:
     row, paper = scoreboard.read(RESULTS / "18-4-best-0"), PRESETS["paper"]
     assert dataclasses.replace(row, config=BEST).agent == "tdanet --preset best"
     network = dataclasses.replace(BEST.network, triangulation=False, reach_threshold=None)
+    own = {"reach_threshold": None, "temperature": 1.0, "done_bias": 0.0}
     for config, agent in (
+        (  # nearer to robust, but for the senses
+            dataclasses.replace(
+                BEST,
+                extra_targets=None,
+                learner=dataclasses.replace(BEST.learner, imitation_weight=0.0),
+                network=dataclasses.replace(BEST.network, **own),
+            ),
+            "tdanet --preset best --extra-targets None --imitation-weight 0.0 "
+            "--reach-threshold None --temperature 1.0 --done-bias 0.0",
+        ),
         (
             dataclasses.replace(BEST, network=network),
             "tdanet --preset best --no-triangulation --reach-threshold None",
