@@ -1,6 +1,7 @@
 """What a robot's camera, and not tilting it, cost an agent on the test episodes.
 
     python examples/robot_limits.py agents/18-4-best 69 55
+    python examples/robot_limits.py agents/18-4-best 69 55 1 0  # temperature, bias for Done
 
 The rooms' boxes are clipped to what such a camera sees. The agent is shown them as they are in the
 camera's own image, or mapped as `Camera` does. Success is judged as always: a target counts as
@@ -14,6 +15,7 @@ import sys
 
 import numpy as np
 
+from tdanet_jax import Decisions
 from tdanet_jax.analysis import trace
 from tdanet_jax.evaluation import episodes, metrics, policies, report, rollout
 from tdanet_jax.evaluation.episodes import Episodes
@@ -44,11 +46,17 @@ def looking(tables: SceneTables, chosen: Episodes, horizon: int) -> Episodes:
     return dataclasses.replace(chosen, pose=pose.astype(chosen.pose.dtype))
 
 
-def main(run: str = "agents/18-4-best", hfov: float = 69, vfov: float = 55) -> None:
+def main(
+    run: str = "agents/18-4-best",
+    hfov: float = 69,
+    vfov: float = 55,
+    temperature: float | None = None,
+    done_bias: float | None = None,
+) -> None:
     """Prints success rate and SPL of each case, of sampled actions."""
     if not (0 < hfov <= 90 and 0 < vfov <= 90):
         raise SystemExit("the rooms' boxes show cameras of up to 90 degrees")
-    rooms = dataset.load_rooms(None)
+    rooms, decisions = dataset.load_rooms(None), Decisions(None, temperature, done_bias)
     raw, mapped = (through(rooms.tables, hfov, vfov, chosen) for chosen in (False, True))
     camera = f"{hfov:g} x {vfov:g} degrees"
     for case, tables, forbidden, horizon in (
@@ -59,7 +67,8 @@ def main(run: str = "agents/18-4-best", hfov: float = 69, vfov: float = 55) -> N
         (f"{camera}, mapped, no tilt", mapped, TILTS, 0),
         (f"{camera}, mapped, always 30 degrees down", mapped, TILTS, 30),
     ):
-        player = trace.load_player(run, dataclasses.replace(rooms, tables=tables))
+        shown = dataclasses.replace(rooms, tables=tables)
+        player = trace.load_player(run, shown, decisions=decisions)
         task = player.task
         policy = policies.network(player.model, task.words, forbidden=forbidden)
         lists = {
@@ -74,4 +83,4 @@ def main(run: str = "agents/18-4-best", hfov: float = 69, vfov: float = 55) -> N
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2], *map(float, sys.argv[2:4]))
+    main(*sys.argv[1:2], *map(float, sys.argv[2:6]))
