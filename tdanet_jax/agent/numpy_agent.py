@@ -68,8 +68,6 @@ _KINDS: dict[str, type] = {
     "width": int, "hidden": int, "action_units": int, "sensor_units": int, "target_box": list,
     "reach_threshold": float, "reach_units": int, "temperature": float, "done_bias": float,
 }  # fmt: skip
-#: The fields of `Decisions`.
-_DECISIONS = ("reach_threshold", "temperature", "done_bias")
 #: Fields that folders of older versions lack.
 _DEFAULTS = {"reach_threshold": 0.0, "reach_units": 0, "temperature": 1.0, "done_bias": 0.0}
 
@@ -320,8 +318,9 @@ def _read_meta(path: Path) -> Meta:
         raise FileError(path, f"no sensor is called {min(unknown)}")
     if values["reach_units"] and not {*TRACKING} & {*values["sensors"]}:
         raise FileError(path, "reach_units: needs triangulation among the sensors")
+    names = [field.name for field in dataclasses.fields(Decisions)]
     try:
-        Decisions(*(values[name] for name in _DECISIONS)).check()
+        Decisions(**{name: values[name] for name in names}).check()
     except ValueError as error:
         raise FileError(path, error) from None
     lists = {name: tuple(values[name]) for name, kind in _KINDS.items() if kind is list}

@@ -86,9 +86,7 @@ def choose(
     return out
 
 
-def find_names(
-    flag: str, given: Collection[str], known: Iterable[str], kind: str = "test episode"
-) -> list[str]:
+def find_names(flag: str, given: Collection[str], known: Iterable[str], kind: str) -> list[str]:
     """The names that a flag gives; all that are known if it gives none.
 
     Args:

@@ -13,7 +13,7 @@ import hashlib
 import json
 import re
 import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -110,23 +110,20 @@ def of_agents(rows: Iterable[Row]) -> list[str]:
     The flags that all of them share are given once, before the table.
     """
     agents = _by_agent(rows)
-    common = [flag for flag in next(iter(agents.values()))[0].flags if _all_have(agents, flag)]
+    flags = [seeds[0].flags for seeds in agents.values()]
+    common = [flag for flag in flags[0] if all(flag in own for own in flags)]
     shared = len(agents) > 1 and len(common) > 1
     shown = []
-    for agent, (first, *others) in agents.items():
-        own = " ".join(flag for flag in first.flags if flag not in common) if shared else agent
-        _, _, *cells = _of_agent(agent, [first, *others])
-        name = _code(own) if own else "as it is"
-        shown.append(((name, *cells), comparison.summary([r.results for r in (first, *others)])))
+    for own, (agent, seeds) in zip(flags, agents.items(), strict=True):
+        rest = " ".join(flag for flag in own if flag not in common) if shared else agent
+        _, _, *cells = _of_agent(agent, seeds)
+        name = _code(rest) if rest else "as it is"
+        shown.append(((name, *cells), comparison.summary([row.results for row in seeds])))
     table = comparison.table(
         (_HEADS[0], *_HEADS[2:]), shown, buckets=("L>=1",), measures=comparison.MEASURES
     )
     said = [f"Each is {_code(' '.join(common))} with what its row says.", ""] if shared else []
     return ["", *said, *table, ""]
-
-
-def _all_have(agents: Mapping[str, Sequence[Row]], flag: str) -> bool:
-    return all(flag in seeds[0].flags for seeds in agents.values())
 
 
 def _by_agent(rows: Iterable[Row]) -> dict[str, list[Row]]:
