@@ -234,7 +234,7 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
                 yield benchmarking.rollout_row(task, count, repeats) | {"precision": precision}
             if "update" in command.parts:
                 row = benchmarking.update_row(task, count, repeats)
-                share = benchmarking.share_of_peak(task, row, peak) if name == "tdanet" else {}
+                share = benchmarking.share_of_peak(task, row, peak)
                 yield {**row, **share, "precision": precision}
             if "profile" in command.parts:
                 from tdanet_jax.tools import profiling

@@ -29,9 +29,9 @@ from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import EnvParams, Observation
 from tdanet_jax.evaluation import episodes, policies, rollout, saved_networks
 from tdanet_jax.models import actor_critic, parameter_count
-from tdanet_jax.models.actor_critic import SENSOR_UNITS, ActorCritic
-from tdanet_jax.sensors import suite
+from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.task import Task, load_task
+from tdanet_jax.tools.arithmetic import OPERATIONS, forward_macs
 from tdanet_jax.training import devices, history, learner
 from tdanet_jax.vocabulary import NUM_ACTIONS
 from tdanet_jax.workflows.export import check as check_export
@@ -160,28 +160,14 @@ def update_row(task: Task, count: int, repeats: int) -> Row:
 
 
 def share_of_peak(task: Task, update: Row, peak: float | None) -> Row:
-    """Operations of TDANet's update by the formula, and their share of the peak."""
-    by_hand = 6 * tdanet_forward_macs(task.model, task.train_words.shape[1])
-    gflops = by_hand * update["steps_per_second"] / 1e9
+    """Operations of the products that an update needs, and their share of the peak."""
+    operations = OPERATIONS * forward_macs(task.model, task.train_words, task.train_params)
+    gflops = operations * update["steps_per_second"] / 1e9
     return {
-        "megaflop_per_step_by_hand": round(by_hand / 1e6, 2),
+        "megaflop_per_step": round(operations / 1e6, 2),
         "gflops": round(gflops, 1),
         "share_of_float32_peak": round(gflops / peak, 3) if peak else None,
     }
-
-
-def tdanet_forward_macs(model: ActorCritic, words_width: int) -> int:
-    """Multiply-accumulates of one forward step of TDANet, from the sizes of its layers.
-
-    The work on the class table, once per update, is not counted.
-    """
-
-    width, hidden = model.encoder.width, model.hidden
-    encoder = (model.spec.columns + words_width) * width + 3 * width * width
-    action = NUM_ACTIONS * model.action_width
-    sensors = SENSOR_UNITS if model.spec.sensors else 0
-    lstm = (width + sensors + model.action_width + hidden) * 4 * hidden
-    return encoder + action + sensors * suite.width(model.spec) + lstm + hidden * (NUM_ACTIONS + 1)
 
 
 def update_cost(

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.evaluation import episodes, metrics, paper, policies, rollout
 from tdanet_jax.task import load_task
-from tdanet_jax.tools.benchmarking import Row, tdanet_forward_macs
+from tdanet_jax.tools.arithmetic import OPERATIONS, forward_macs
+from tdanet_jax.tools.benchmarking import Row
 from tdanet_jax.training.run import Run
 
 #: Steps from one evaluation to the next, rounded to whole chunks of updates.
@@ -118,12 +119,10 @@ def _rates(records: rollout.Records) -> tuple[float, float]:
 
 
 def _spent(run: Run) -> Row:
-    row: Row = {
+    macs = forward_macs(run.model, run.task.train_words, run.task.train_params)
+    return {
         "seconds": round(run.seconds, 1),
         "steps": run.steps,
         "episodes": int(run.state.episodes),
+        "teraflop": round(OPERATIONS * macs * run.steps / 1e12, 1),
     }
-    if run.config.model == "tdanet":
-        macs = tdanet_forward_macs(run.model, run.task.train_words.shape[1])
-        row["teraflop"] = round(6 * macs * run.steps / 1e12, 1)
-    return row

@@ -1,16 +1,10 @@
-"""The benchmark command: its figures' names, its count of operations, and wrong arguments."""
+"""The benchmark command: its figures' names, and wrong arguments."""
 
 import json
 
-import jax
-import jax.numpy as jnp
 import pytest
 
 from tdanet_jax.commands import benchmark
-from tdanet_jax.config import NetworkConfig, TrainConfig
-from tdanet_jax.models.classes import ClassVocabulary
-from tdanet_jax.models.factory import make_model
-from tdanet_jax.tools import benchmarking
 from tests.agent.test_agent import OLD_RUN
 
 
@@ -80,20 +74,6 @@ def test_a_model_that_cannot_triangulate_is_one_line(ithor, tmp_path, capsys):
     assert ended.value.code == 2
     said = capsys.readouterr().err.splitlines()[-1]
     assert "needs a box of every object, which ssnet does not show" in said
-
-
-@pytest.mark.parametrize("senses", [(False, False), (True, False), (True, True)])
-def test_the_hand_formula_counts_the_kernels_that_a_step_uses(senses):
-    """All kernels but W_L's, which is used once per update for the table of classes."""
-    odometry, triangulation = senses
-    network = NetworkConfig(
-        width=32, hidden=48, precision="float32", odometry=odometry, triangulation=triangulation
-    )
-    model = make_model(TrainConfig(network=network), ClassVocabulary())
-    weights = jax.eval_shape(model.initialise, jax.random.key(0), jnp.ones((5, 50)))
-    del weights["encoder"]["attention"]
-    kernels = sum(leaf.size for leaf in jax.tree.leaves(weights) if leaf.ndim == 2)
-    assert benchmarking.tdanet_forward_macs(model, 50) == kernels
 
 
 @pytest.mark.slow

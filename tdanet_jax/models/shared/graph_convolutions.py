@@ -22,7 +22,7 @@ from flax import struct
 from tdanet_jax.models.activation_cache import cached
 from tdanet_jax.models.matmul import materialized_transpose, product
 
-#: Sizes are padded with zeros to multiples of this, which matrix units need.
+#: With bfloat16 operands, sizes are padded with zeros to multiples of this: matrix units need it.
 ROUND = 32
 
 
@@ -35,10 +35,9 @@ class Convolutions(struct.PyTreeNode):
     second: jax.Array  # [h, h], W1
     third: jax.Array  # [h, u], W2
 
-    def padded(self) -> Convolutions:
-        """The same with round sizes."""
-        count, width = self.words.shape
-        nodes, units = (0, -count % ROUND), (0, -width % ROUND)
+    def padded(self, more_nodes: int, more_units: int) -> Convolutions:
+        """The same with additional nodes and units of zeros."""
+        nodes, units = (0, more_nodes), (0, more_units)
         return Convolutions(
             words=jnp.pad(self.words, (nodes, units)),
             degree=jnp.pad(self.degree, nodes),
@@ -68,8 +67,10 @@ def apply(module: nn.Module, weights: Convolutions, shared: jax.Array, dtype: An
       dtype: operands of the large products.
     """
     count, width = weights.words.shape
-    shared = jnp.pad(shared, ((0, 0),) * (shared.ndim - 1) + ((0, -width % ROUND),))
-    padded = weights.padded()
+    multiple = ROUND if jnp.dtype(dtype) == jnp.bfloat16 else 1
+    units = -width % multiple
+    shared = jnp.pad(shared, ((0, 0),) * (shared.ndim - 1) + ((0, units),))
+    padded = weights.padded(-count % multiple, units)
     constant = jax.lax.stop_gradient((padded, shared))
     value = cached(module, "nodes", lambda: forward(*constant, dtype))
     return convolve(padded, shared, dtype, value)[..., :count, :]
