@@ -53,6 +53,11 @@ class Pools:
         """The turn in which an update after so many takes place; always 0 with a single pool."""
         return updates // self._updates if self._count > 1 else 0
 
+    @property
+    def unreached(self) -> int:
+        """How many pools a budget in steps leaves out: it ends before their first turn."""
+        return sum(self._ends_before(turn) for turn in range(1, self._count))
+
     def lengthen_frames(self, rows: int) -> None:
         """Makes frames at least so long, as they were when a checkpoint was written.
 
@@ -93,8 +98,7 @@ class Pools:
             self.params = jax.device_put(found.padded(self.params), self._sharding)
             self.entered = turn
         following = (turn + 1) % self._count
-        steps = (turn + 1) * self._updates * self._config.steps_per_update
-        if following and self._config.spent(steps, 0, 0.0) < 1.0:
+        if following and not self._ends_before(turn + 1):
             self._load(following)
 
     def close(self) -> None:
@@ -102,6 +106,11 @@ class Pools:
         if self._loading is not None:
             self._loading.stop()
             self._loading = None
+
+    def _ends_before(self, turn: int) -> bool:
+        """Whether a budget in steps ends before a turn."""
+        steps = turn * self._updates * self._config.steps_per_update
+        return self._config.spent(steps, 0, 0.0) >= 1.0
 
     def _load(self, number: int) -> _Loading:
         """Loading of a pool other than the first, begun now or before."""

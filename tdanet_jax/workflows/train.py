@@ -203,6 +203,11 @@ def _learn(
         return stopped
 
     saved = save()  # a folder that cannot be written shows before training, not after
+    if unreached := runs[0].pools.unreached:
+        callbacks.on_note(
+            f"note: the budget ends before {unreached} of the pools of rooms have had a turn; "
+            "with a lower --pool-updates they will"
+        )
     callbacks.on_note("compiling ...")
     with callbacks.shield():
         if stops():

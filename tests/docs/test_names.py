@@ -24,7 +24,7 @@ FOREIGN = {
 }  # fmt: skip
 #: Where the files are that a page may name.
 FOLDERS = (
-    "tests/", "tdanet_jax/", "experiments/", "docs/", "assets/", "agents/18", "notebooks/",
+    "tests/", "tdanet_jax/", "experiments/", "docs/", "assets/", "agents/1", "agents/2", "notebooks/",
     "results/", ".ci/",
 )  # fmt: skip
 

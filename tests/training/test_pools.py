@@ -260,19 +260,36 @@ class Watching(Callbacks):
         self.stopped = True
 
 
+@pytest.mark.parametrize(("steps", "unreached"), [(640, 0), (321, 0), (320, 1), (160, 2), (1, 2)])
+def test_a_run_says_which_pools_its_budget_leaves_out(
+    task: Task, steps: int, unreached: int
+) -> None:
+    """Turns of 160 steps, in three pools."""
+    assert pools_of(task, dataclasses.replace(TINY, steps=steps)).unreached == unreached
+    timed = dataclasses.replace(TINY, steps=None, minutes=1.0)
+    assert pools_of(task, timed).unreached == 0
+
+
 @pytest.mark.parametrize("stop", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_run_that_waits_for_rooms_says_so_and_can_be_stopped(
     task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow: threading.Event, stop: bool
 ) -> None:
     monkeypatch.setattr(workflow, "SECONDS_OF_WAITING", 0.02)
-    monkeypatch.setattr(workflow, "load_task", lambda *_: waiting(task, slow))
+    slow_task = waiting(task, slow)
+    config = TINY
+    if stop:  # two further pools, of which the budget reaches one
+        slow_task = dataclasses.replace(slow_task, further_pools=slow_task.further_pools * 2)
+        config = dataclasses.replace(TINY, steps=320)
+    monkeypatch.setattr(workflow, "load_task", lambda *_: slow_task)
     monkeypatch.setattr(workflow, "_report", lambda *_: {})
     monkeypatch.setattr(episodes, "load", lambda *_: {})
     watching = Watching(slow, stop)
-    workflow.train(TINY, tmp_path / "run", callbacks=watching)
+    workflow.train(config, tmp_path / "run", callbacks=watching)
     assert len(watching.told) >= 2
     assert {*watching.told} <= {(0.0, 1), (3.0, 10), (4.0, 10)}
     assert watching.notes.count("waiting for the next pool of rooms ...") == 1
+    left_out = "note: the budget ends before 1 of the pools of rooms have had a turn"
+    assert any(note.startswith(left_out) for note in watching.notes) == stop
     assert watching.stopped == stop
     assert len(read_metrics(tmp_path / "run")) == (2 if stop else 8)
     if stop:  # it waits again, and is stopped again
@@ -307,6 +324,7 @@ def test_turns_are_whole_chunks_and_one_pool_has_no_turns(task: Task) -> None:
     assert [pools_of(task, config).turn(updates) for updates in (0, 10, 20)] == [0, 1, 2]
     alone = pools_of(dataclasses.replace(task, further_pools=()))
     assert alone.turn(1000) == 0
+    assert alone.unreached == 0
     chex.assert_trees_all_equal(alone.params, task.train_params)
 
 
