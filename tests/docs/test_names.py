@@ -24,8 +24,8 @@ FOREIGN = {
 }  # fmt: skip
 #: Where the files are that a page may name.
 FOLDERS = (
-    "tests/", "tdanet_jax/", "experiments/", "docs/", "assets/", "agents/1", "agents/2", "notebooks/",
-    "results/", ".ci/",
+    "tests/", "tdanet_jax/", "experiments/", "docs/", "assets/", "agents/1", "agents/2",
+    "notebooks/", "results/", ".ci/",
 )  # fmt: skip
 
 pages = pytest.mark.parametrize("page", PAGES)
