@@ -455,25 +455,18 @@ PAPER = TrainConfig(
     ),
     network=NetworkConfig(dropout=0.25, rows="object"),
 )
-#: What did best on validation, with sensors that the paper does not have, and networks of half the
-#: paper's width, which are more than twice as fast (docs/results.md).
+#: What did best on validation, with sensors that the paper does not have (docs/results.md).
 BEST = TrainConfig(
     extra_targets="all",
     learner=LearnerConfig(gamma=0.97, size_noise=0.5, imitation_weight=0.3),
     network=NetworkConfig(
-        width=256,
-        hidden=256,
-        odometry=True,
-        triangulation=True,
-        reach_threshold=0.5,
-        temperature=0.3,
-        done_bias=2.0,
+        odometry=True, triangulation=True, reach_threshold=0.5, temperature=0.3, done_bias=2.0
     ),
 )
 #: For robots: senses that err in training, by up to twice the levels of `mix`, and by up to 3
 #: degrees of heading, which cost more than all else (docs/noise.md). Of BEST, it lacks what has not
-#: been tried with agents that were trained under noise: half the width, the estimate of reach,
-#: imitation, extra targets, and other decisions than in training.
+#: been tried with agents that were trained under noise: the estimate of reach, imitation, extra
+#: targets, and other decisions than in training.
 ROBUST = dataclasses.replace(
     BEST,
     extra_targets=None,
@@ -486,8 +479,6 @@ ROBUST = dataclasses.replace(
     ),
     network=dataclasses.replace(
         BEST.network,
-        width=NetworkConfig.width,
-        hidden=NetworkConfig.hidden,
         robust_triangulation=True,
         scores=True,
         reach_threshold=None,

@@ -106,8 +106,7 @@ def test_the_robust_preset_is_the_best_with_senses_that_err():
     assert configs.PRESETS["robust"].learner.noise == noise
     assert configs.PRESETS["robust"].network.spec.sensors == ("odometry", "robust-triangulation")
     changed = {"noise", "robust_triangulation", "scores", "reach_threshold", "imitation_weight"}
-    changed |= {"temperature", "done_bias", "width", "hidden"}
-    assert configs.ROBUST.network.width == configs.ROBUST.network.hidden == 512
+    changed |= {"temperature", "done_bias"}
     assert configs.ROBUST.extra_targets is None
     differ = set()
     for part in ("learner", "network"):

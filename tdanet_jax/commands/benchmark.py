@@ -3,9 +3,9 @@
     tdanet benchmark --out benchmark.jsonl
 
 Every value is the median over repetitions. Shares of the peak count 6 floating-point operations
-(forward and backward) for each multiply-accumulate of a forward step, by a formula; work that is
-done twice counts once. The peak is the best rate of a float32 product of batch x 1024 by
-1024 x 2048, measured in the same run.
+(forward and backward) for each multiply-accumulate of a forward step, which are counted in the
+model's program; work that is done twice counts once. The peak is the best rate of a float32 product
+of batch x 1024 by 1024 x 2048, measured in the same run.
 """
 
 from __future__ import annotations
@@ -223,6 +223,9 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
     from tdanet_jax.tools import benchmarking
 
     repeats, measured = command.repeats, set()
+    operations = 0
+    if "update" in command.parts:
+        operations = benchmarking.operations_per_step(load_task(command.config(name, "float32")))
     for asked in command.precisions if TRAINED & set(command.parts) else ():
         task = load_task(command.config(name, asked))
         precision = jnp.dtype(task.model.dtype).name
@@ -234,7 +237,7 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
                 yield benchmarking.rollout_row(task, count, repeats) | {"precision": precision}
             if "update" in command.parts:
                 row = benchmarking.update_row(task, count, repeats)
-                share = benchmarking.share_of_peak(task, row, peak)
+                share = benchmarking.share_of_peak(operations, row, peak)
                 yield {**row, **share, "precision": precision}
             if "profile" in command.parts:
                 from tdanet_jax.tools import profiling

@@ -31,10 +31,10 @@ class Command:
     preset: Literal["default", "best", "robust", "paper"] = "default"
     """Defaults of the other flags. best: --odometry, --triangulation, --reach-threshold 0.5,
     --temperature 0.3, --done-bias 2, --gamma 0.97, --size-noise 0.5, --imitation-weight 0.3 and
-    --extra-targets all, which did best on validation, with --width 256 and --hidden 256. robust,
-    for robots, whose senses err: --odometry, --triangulation, --robust-triangulation, --scores,
-    --gamma 0.97, --size-noise 0.5 and --noise. paper: the reference implementation's
-    hyperparameters and its budget of 6 M episodes."""
+    --extra-targets all, which did best on validation. robust, for robots, whose senses err:
+    --odometry, --triangulation, --robust-triangulation, --scores, --gamma 0.97, --size-noise 0.5
+    and --noise. paper: the reference implementation's hyperparameters and its budget of 6 M
+    episodes."""
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""
     resume: Path | None = None

@@ -7,7 +7,7 @@ import math
 import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray
-from jax.extend.core import Jaxpr, jaxprs_in_params
+from jax.extend.core import Jaxpr, Literal, Var, jaxprs_in_params
 
 from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import dynamics
@@ -16,9 +16,9 @@ from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
-#: Operations of an update for each multiply-accumulate of a forward step: two forward, and twice as
-#: many backward, for the gradients of inputs and of weights.
-OPERATIONS = 6
+#: Operations of an update for each multiply-accumulate of a forward step, by convention: two
+#: forward, and twice as many backward, for the gradients of both factors.
+UPDATE_OPERATIONS = 6
 
 
 def forward_macs(model: ActorCritic, words: jax.Array, params: EnvParams) -> int:
@@ -53,15 +53,28 @@ def _rollout_macs(
 
 
 def product_macs(program: Jaxpr) -> int:
-    """Multiply-accumulates of a program's products of matrices; of a condition, both branches'."""
+    """Multiply-accumulates of a program's products of matrices and convolutions.
+
+    Of a condition, those of all branches are counted, and of a `while` loop those of one turn.
+    """
     total = 0
     for equation in program.eqns:
-        if equation.primitive.name == "dot_general":
-            (contracted, _), _ = equation.params["dimension_numbers"]
-            factor, result = (v[0].aval for v in (equation.invars, equation.outvars))
-            assert isinstance(factor, ShapedArray)
-            assert isinstance(result, ShapedArray)
-            total += math.prod(factor.shape[axis] for axis in contracted) * result.size
-        times = equation.params["length"] if equation.primitive.name == "scan" else 1
-        total += times * sum(map(product_macs, jaxprs_in_params(equation.params)))
+        kind, params = equation.primitive.name, equation.params
+        if kind == "dot_general":
+            (contracted, _), _ = params["dimension_numbers"]
+            factor = _shape(equation.invars[0])
+            each = math.prod(factor[axis] for axis in contracted)
+            total += each * math.prod(_shape(equation.outvars[0]))
+        elif kind == "conv_general_dilated":
+            kernel = _shape(equation.invars[1])
+            each = math.prod(kernel) // kernel[params["dimension_numbers"].rhs_spec[0]]
+            total += each * math.prod(_shape(equation.outvars[0]))
+        times = params["length"] if kind == "scan" else 1
+        total += times * sum(map(product_macs, jaxprs_in_params(params)))
     return total
+
+
+def _shape(variable: Var | Literal) -> tuple[int, ...]:
+    assert isinstance(variable.aval, ShapedArray)
+    shape: tuple[int, ...] = variable.aval.shape
+    return shape

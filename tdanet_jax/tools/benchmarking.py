@@ -31,7 +31,7 @@ from tdanet_jax.evaluation import episodes, policies, rollout, saved_networks
 from tdanet_jax.models import actor_critic, parameter_count
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.task import Task, load_task
-from tdanet_jax.tools.arithmetic import OPERATIONS, forward_macs
+from tdanet_jax.tools.arithmetic import UPDATE_OPERATIONS, forward_macs
 from tdanet_jax.training import devices, history, learner
 from tdanet_jax.vocabulary import NUM_ACTIONS
 from tdanet_jax.workflows.export import check as check_export
@@ -159,9 +159,23 @@ def update_row(task: Task, count: int, repeats: int) -> Row:
     return {"part": "update", **cost}
 
 
-def share_of_peak(task: Task, update: Row, peak: float | None) -> Row:
-    """Operations of the products that an update needs, and their share of the peak."""
-    operations = OPERATIONS * forward_macs(task.model, task.train_words, task.train_params)
+def operations_per_step(task: Task) -> int:
+    """Operations of the products that an update needs for one environment step.
+
+    Args:
+      task: with a model that multiplies in float32: some are padded with zeros in bfloat16.
+    """
+    return UPDATE_OPERATIONS * forward_macs(task.model, task.train_words, task.train_params)
+
+
+def share_of_peak(operations: int, update: Row, peak: float | None) -> Row:
+    """What an update multiplies in a second, and the share of the peak that this is.
+
+    Args:
+      operations: per environment step, from `operations_per_step`.
+      update: its `update_row`.
+      peak: rate of float32 products, GFLOP/s; None if it was not measured.
+    """
     gflops = operations * update["steps_per_second"] / 1e9
     return {
         "megaflop_per_step": round(operations / 1e6, 2),

@@ -10,8 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.evaluation import episodes, metrics, paper, policies, rollout
 from tdanet_jax.task import load_task
-from tdanet_jax.tools.arithmetic import OPERATIONS, forward_macs
-from tdanet_jax.tools.benchmarking import Row
+from tdanet_jax.tools.benchmarking import Row, operations_per_step
 from tdanet_jax.training.run import Run
 
 #: Steps from one evaluation to the next, rounded to whole chunks of updates.
@@ -74,12 +73,13 @@ def quality_row(config: TrainConfig) -> Row:
 
     Returns:
       Whether they passed, and what had been spent at the first of them: seconds of training,
-      without compilation and evaluation, steps, episodes, and for `tdanet` floating-point
-      operations by the formula; the last SR and SPL; seconds of evaluation, and of all.
+      without compilation and evaluation, steps, episodes, and floating-point operations of the
+      products; the last SR and SPL; seconds of evaluation, and of all.
     """
     task, began = load_task(config), time.perf_counter()
     policy = policies.network(task.model, task.words)
     lists = episodes.load(task.tables, task.split, task.extras)
+    operations = operations_per_step(task)
     evaluating = 0.0
 
     def evaluated(run: Run) -> Iterator[tuple[Bar, Row]]:
@@ -94,7 +94,7 @@ def quality_row(config: TrainConfig) -> Row:
                 evaluating += time.perf_counter() - paused
                 yield (
                     {group: _rates(records) for group, (_, records) in played.items()},
-                    _spent(run),
+                    _spent(run, operations),
                 )
 
     with tempfile.TemporaryDirectory() as folder:
@@ -118,11 +118,10 @@ def _rates(records: rollout.Records) -> tuple[float, float]:
     return 100 * float(records.success.mean()), 100 * float(efficiency.mean())
 
 
-def _spent(run: Run) -> Row:
-    macs = forward_macs(run.model, run.task.train_words, run.task.train_params)
+def _spent(run: Run, operations: int) -> Row:
     return {
         "seconds": round(run.seconds, 1),
         "steps": run.steps,
         "episodes": int(run.state.episodes),
-        "teraflop": round(OPERATIONS * macs * run.steps / 1e12, 1),
+        "teraflop": round(operations * run.steps / 1e12, 1),
     }

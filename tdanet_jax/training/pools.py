@@ -23,7 +23,7 @@ SPARE = 0.05
 class Pools:
     """The pools of rooms that a run trains in, or several seeds that train together.
 
-    Pools take turns, numbered from 0. `params` is the environment of turn `entered`.
+    `count` pools take turns, numbered from 0. `params` is the environment of turn `entered`.
     """
 
     def __init__(self, task: Task, config: TrainConfig, sharding: NamedSharding) -> None:
@@ -33,12 +33,12 @@ class Pools:
           sharding: where tables lie.
         """
         self._task, self._config, self._sharding = task, config, sharding
-        self._count = 1 + len(task.further_pools)
+        self.count = 1 + len(task.further_pools)
         chunks = max(1, round(config.pool_updates / config.chunk_updates))
         self._updates = chunks * config.chunk_updates  # in a turn
         self._loading: _Loading | None = None
         first = task.train_params
-        if self._count > 1:
+        if self.count > 1:
             first = first.padded(first, SPARE)
         self.entered = 0
         self.params: EnvParams = jax.device_put(first, sharding)
@@ -51,12 +51,12 @@ class Pools:
 
     def turn(self, updates: int) -> int:
         """The turn in which an update after so many takes place; always 0 with a single pool."""
-        return updates // self._updates if self._count > 1 else 0
+        return updates // self._updates if self.count > 1 else 0
 
     @property
     def unreached(self) -> int:
         """How many pools a budget in steps leaves out: it ends before their first turn."""
-        return sum(self._ends_before(turn) for turn in range(1, self._count))
+        return sum(self._ends_before(turn) for turn in range(1, self.count))
 
     def lengthen_frames(self, rows: int) -> None:
         """Makes frames at least so long, as they were when a checkpoint was written.
@@ -72,7 +72,7 @@ class Pools:
         Returns:
           (rooms done, rooms of the pool) until it can be entered, then None.
         """
-        number = turn % self._count
+        number = turn % self.count
         if not number or turn == self.entered:
             return None
         return self._load(number).wait(seconds)
@@ -86,7 +86,7 @@ class Pools:
             changed then.
         """
         if turn != self.entered:
-            number, found = turn % self._count, None
+            number, found = turn % self.count, None
             error: Exception | None = None
             try:
                 found = self._load(number).result() if number else self._task.train_params
@@ -97,7 +97,7 @@ class Pools:
             self._loading = None
             self.params = jax.device_put(found.padded(self.params), self._sharding)
             self.entered = turn
-        following = (turn + 1) % self._count
+        following = (turn + 1) % self.count
         if following and not self._ends_before(turn + 1):
             self._load(following)
 

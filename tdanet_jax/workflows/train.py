@@ -203,10 +203,11 @@ def _learn(
         return stopped
 
     saved = save()  # a folder that cannot be written shows before training, not after
-    if unreached := runs[0].pools.unreached:
+    pools = runs[0].pools
+    if pools.unreached:
         callbacks.on_note(
-            f"note: the budget ends before {unreached} of the pools of rooms have had a turn; "
-            "with a lower --pool-updates they will"
+            f"note: {pools.unreached} of {pools.count} pools of rooms get no turn before the budget"
+            " ends; with a lower --pool-updates turns are shorter"
         )
     callbacks.on_note("compiling ...")
     with callbacks.shield():

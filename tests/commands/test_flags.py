@@ -142,6 +142,7 @@ def prepare_benchmark(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.training.devices.connect", gives=None)
     recorder.record("tdanet_jax.training.devices.check_divides", gives=None)
     recorder.record("tdanet_jax.evaluation.saved_networks.find", gives=None)
+    recorder.record("tdanet_jax.tools.benchmarking.operations_per_step", gives=int)
     recorder.record("tdanet_jax.tools.benchmarking.share_of_peak", gives=dict)
     recorder.record("tdanet_jax.tools.benchmarking.machine_row", *BENCHMARKS, gives=row)
     recorder.record("tdanet_jax.tools.profiling.profile_row", gives=row)
@@ -744,7 +745,7 @@ def test_the_files_of_a_run_are_opened(
 def test_checkpoints_are_written_at_their_interval(minutes: float, saves: int) -> None:
     """In five minutes, after whose first and last moment there is one anyway."""
     config = TrainConfig(checkpoint_minutes=minutes)
-    run = SimpleNamespace(seconds=0.0, config=config, saved=[])
+    run = SimpleNamespace(seconds=0.0, config=config, saved=[], pools=SimpleNamespace(unreached=0))
     run.wait_for_rooms, run.steps = lambda seconds: None, 0
     run.save = lambda: run.saved.append(run.seconds)
 

@@ -23,6 +23,11 @@ SQUARE = jnp.zeros((3, 3))
         (lambda a, b: jax.vmap(lambda row: row @ b)(a), (A, B), 2 * 3 * 5),
         (lambda a, b: jax.jit(lambda x: x @ b @ b.T)(a), (A, B), 2 * 2 * 3 * 5),
         (lambda a, b: jax.lax.scan(lambda x, _: (x @ b, x), a, length=7), (A, SQUARE), 7 * 2 * 9),
+        (  # 4 places, 5 channels out of 3, over 2 places each
+            lambda a, b: jax.lax.conv(jnp.ones((1, 3, 5)), jnp.ones((5, 3, 2)), (1,), "VALID"),
+            (A, B),
+            4 * 5 * 3 * 2,
+        ),
         (
             lambda a, b: jax.lax.cond(a[0, 0] > 0, lambda: a @ b, lambda: a @ b @ b),
             (A, SQUARE),
@@ -69,3 +74,8 @@ def test_mjolnir_multiplies_its_graph_by_the_nodes(ithor):
     third = nodes * width * units + nodes * nodes * units
     fourth = nodes * 2 * units + nodes * nodes + sizes(graph["mapping"])
     assert macs == sizes(shapes) + first + second + third + fourth
+
+
+@pytest.mark.parametrize("more", ["sp", "savn"])
+def test_graphs_and_inner_steps_add_to_the_image(more, ithor):
+    assert counted(more)[0] > counted("baseline")[0]
