@@ -239,7 +239,9 @@ def test_the_bundled_agents_fail_as_often_as_their_results_say(ithor, glove, age
     run, params = find_run(agent), make_task(TINY, ithor, glove).eval_params
     summary = failures.summarise(agent, "18/4", read_records(run, ithor), ithor, params)
     results = json.loads((run / "results.json").read_text())
-    for group in ("seen", "unseen"):
+    present = [group for group in ("seen", "unseen") if results[group] is not None]
+    assert present[0] == "seen"
+    for group in present:
         whole = results[group]["L>=1"]
         assert summary.episodes(group=group) == whole["n"]
         assert summary.count(group=group) == round(whole["n"] * (1 - whole["SR"] / 100))

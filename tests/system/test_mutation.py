@@ -88,7 +88,7 @@ FAULTS = (
           "[] if self.config.generated_only else [rooms]", "[rooms]",
           "scenes/test_generated.py"),
     Fault("pools of rooms never change", "training/pools.py",
-          "updates // self._updates if self._count > 1 else 0", "0", "training/test_pools.py"),
+          "updates // self._updates if self.count > 1 else 0", "0", "training/test_pools.py"),
     Fault("episodes go on in other rooms", "training/run.py",
           "self.state = self._begin_again(self.state, self.pools.params)", "pass",
           "training/test_pools.py"),
