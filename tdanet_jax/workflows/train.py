@@ -206,8 +206,8 @@ def _learn(
     pools = runs[0].pools
     if pools.unreached:
         callbacks.on_note(
-            f"note: {pools.unreached} of {pools.count} pools of rooms get no turn before the budget"
-            " ends; with a lower --pool-updates turns are shorter"
+            f"note: pools of rooms that the budget ends before: {pools.unreached} of {pools.count};"
+            " with a lower --pool-updates turns are shorter"
         )
     callbacks.on_note("compiling ...")
     with callbacks.shield():
