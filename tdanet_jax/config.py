@@ -486,7 +486,17 @@ ROBUST = dataclasses.replace(
         done_bias=0.0,
     ),
 )
-PRESETS = {"default": TrainConfig(), "best": BEST, "robust": ROBUST, "paper": PAPER}
+#: What did best on validation of what changes training alone (docs/results.md).
+PAPER_INPUTS = TrainConfig(
+    extra_targets="all", learner=LearnerConfig(gamma=0.97, imitation_weight=0.3)
+)
+PRESETS = {
+    "default": TrainConfig(),
+    "best": BEST,
+    "robust": ROBUST,
+    "paper-inputs": PAPER_INPUTS,
+    "paper": PAPER,
+}
 
 
 def to_json(config: TrainConfig) -> dict[str, Any]:

@@ -116,6 +116,14 @@ def test_the_robust_preset_is_the_best_with_senses_that_err():
     configs.ROBUST.check()
 
 
+def test_the_preset_with_the_inputs_of_the_paper_has_no_others():
+    ours, default = configs.PRESETS["paper-inputs"], configs.PRESETS["default"]
+    assert ours.network == default.network
+    assert ours.network.spec.sensors == ()
+    assert (ours.extra_targets, ours.learner.gamma) == ("all", 0.97)
+    ours.check()
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.5, 2.0])
 def test_size_noise_may_be_as_much_as_two(noise):
     TrainConfig(learner=LearnerConfig(size_noise=noise)).check()

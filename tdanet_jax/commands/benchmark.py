@@ -83,7 +83,7 @@ class Command:
     devices: int = 1
     """Devices that the environments of the `environment` part are split over; a CPU is split into
     as many."""
-    preset: Literal["default", "best", "robust", "paper"] = "default"
+    preset: Literal["default", "best", "robust", "paper-inputs", "paper"] = "default"
     """Preset that the `quality` part trains, on validation, until two evaluations in a row reach
     the paper's figures on split 18/4."""
     num_envs: int | None = None

@@ -28,13 +28,14 @@ class Command:
     """Trains an agent on the iTHOR training rooms and reports SR and SPL in the test rooms."""
 
     run: tyro.conf.OmitArgPrefixes[TrainConfig]
-    preset: Literal["default", "best", "robust", "paper"] = "default"
+    preset: Literal["default", "best", "robust", "paper-inputs", "paper"] = "default"
     """Defaults of the other flags. best: --odometry, --triangulation, --reach-threshold 0.5,
     --temperature 0.3, --done-bias 2, --gamma 0.97, --size-noise 0.5, --imitation-weight 0.3 and
     --extra-targets all, which did best on validation. robust, for robots, whose senses err:
     --odometry, --triangulation, --robust-triangulation, --scores, --gamma 0.97, --size-noise 0.5
-    and --noise. paper: the reference implementation's hyperparameters and its budget of 6 M
-    episodes."""
+    and --noise. paper-inputs: what did best on validation with the inputs that the paper's agent
+    has, --gamma 0.97, --imitation-weight 0.3 and --extra-targets all. paper: the reference
+    implementation's hyperparameters and its budget of 6 M episodes."""
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""
     resume: Path | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -121,7 +122,10 @@ class Pools:
 
 
 class _Loading:
-    """A pool that a thread loads. It ends with the process, or between two rooms if stopped."""
+    """A pool that a thread loads. It ends between two rooms if stopped, or if the process ends.
+
+    Nothing cuts it off: a thread that is in native code when Python ends can crash the process.
+    """
 
     def __init__(self, number: int, load: Callable[[Progress], EnvParams]) -> None:
         self.number = number
@@ -131,6 +135,7 @@ class _Loading:
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name="rooms", daemon=True)
         self._thread.start()
+        atexit.register(self.stop)
 
     def _run(self) -> None:
         try:
@@ -149,6 +154,7 @@ class _Loading:
 
     def result(self) -> EnvParams:
         self._thread.join()
+        atexit.unregister(self.stop)
         assert self._found is not None
         if isinstance(self._found, Exception):
             raise self._found
@@ -156,4 +162,5 @@ class _Loading:
 
     def stop(self) -> None:
         self._stopped = True
+        atexit.unregister(self.stop)
         self._thread.join(10.0)
