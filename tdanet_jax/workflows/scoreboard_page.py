@@ -268,10 +268,16 @@ def _target_point(row: Row) -> Point | None:
         return None
     targets = None
     if config.targets != PAPER:
-        targets = find_targets(config.targets, load_rooms(None), config.validation)[1]
+        targets = _targets(config.targets, config.validation)
     seen = make_split(config.split, config.validation, targets).seen
     count = sum(map(len, seen.values()))
     return "pairs of a room type and a target", "real rooms", count, _rates(row)
+
+
+@functools.cache
+def _targets(text: str, validation: bool) -> dict[str, tuple[str, ...]]:
+    """The targets that `--targets` asks for in the bundled rooms, by room type."""
+    return find_targets(text, load_rooms(None), validation)[1]
 
 
 def _config(row: Row) -> TrainConfig:
