@@ -486,9 +486,11 @@ ROBUST = dataclasses.replace(
         done_bias=0.0,
     ),
 )
-#: What did best on validation of what changes training alone (docs/results.md).
+#: What did best on validation with the inputs that the paper's agent has (docs/results.md).
 PAPER_INPUTS = TrainConfig(
-    extra_targets="all", learner=LearnerConfig(gamma=0.97, imitation_weight=0.3)
+    extra_targets="all",
+    learner=LearnerConfig(gamma=0.97, imitation_weight=0.3),
+    network=NetworkConfig(temperature=0.7),
 )
 PRESETS = {
     "default": TrainConfig(),
