@@ -247,6 +247,8 @@ def main(args: Args) -> None:
     envs.close()
     results = score(agent, config)
     for group in ("seen", "unseen"):
+        if results[group] is None:  # nothing is unseen in 22/0
+            continue
         row = results[group]["L>=1"]
         print(f"{group}: SR {row['SR']:.1f}  SPL {row['SPL']:.1f}")
 

@@ -195,6 +195,8 @@ def main(config: Config) -> None:
     print(f"success in the last tenth of training: {success[-len(success) // 10 :].mean():.1%}")
     results = score(config, flat, weights)
     for group in ("seen", "unseen"):
+        if results[group] is None:  # nothing is unseen in 22/0
+            continue
         row = results[group]["L>=1"]
         print(f"{group}: SR {row['SR']:.1f}  SPL {row['SPL']:.1f}")
 

@@ -145,6 +145,8 @@ def main(args: Args) -> None:
     model.learn(args.total_timesteps, log_interval=10)
     results = score(model, config)
     for group in ("seen", "unseen"):
+        if results[group] is None:  # nothing is unseen in 22/0
+            continue
         row = results[group]["L>=1"]
         print(f"{group}: SR {row['SR']:.1f}  SPL {row['SPL']:.1f}")
 

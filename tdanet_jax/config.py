@@ -16,7 +16,7 @@ from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import FileError, jsons, regular
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.registry import MODELS, SENSORS
-from tdanet_jax.splits import OPEN, file_name, make_split, split_name
+from tdanet_jax.splits import OF_VALIDATION, OPEN, file_name, make_split, split_name
 from tdanet_jax.targets import PAPER as PAPER_TARGETS
 from tdanet_jax.targets import canonical, known_classes, naming
 
@@ -413,7 +413,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
 
 def run_name(config: TrainConfig) -> str:
     """The name of a run's folder: 18-4-tdanet-seed0, Mug-Vase-tdanet-seed0."""
-    split = file_name(config.split) + ("-validation" if config.validation else "")
+    split = file_name(config.split) + (OF_VALIDATION if config.validation else "")
     return f"{split}-{config.model}-seed{config.seed}"
 
 

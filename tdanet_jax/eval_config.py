@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from tdanet_jax import sense_noise
 from tdanet_jax.config import TrainConfig, find_word_vectors, fits, with_decisions
 from tdanet_jax.decisions import OWN_DECISIONS, Decisions
 from tdanet_jax.sense_noise import SenseNoise
-from tdanet_jax.splits import OPEN
+from tdanet_jax.splits import OF_VALIDATION, OPEN
 from tdanet_jax.targets import canonical, known_classes, naming, parse
 
 
@@ -115,9 +115,17 @@ class EvalConfig:
         return dataclasses.replace(config, targets=canonical(self.test_targets))
 
 
-def rooms_played(departures: Mapping[str, Any] | None) -> str:
-    """In which rooms the episodes lie, in words, by `EvalConfig.departures`."""
-    return "training rooms" if (departures or {}).get("training_rooms") else "test rooms"
+def rooms_played(departures: Mapping[str, Any] | None, splits: Iterable[str]) -> str:
+    """In which rooms the episodes lie, in words.
+
+    Args:
+      departures: `EvalConfig.departures`.
+      splits: the names of the splits that were played.
+    """
+    if (departures or {}).get("training_rooms"):
+        return "training rooms"
+    kinds = {"validation" if name.endswith(OF_VALIDATION) else "test" for name in splits}
+    return f"{' and '.join(sorted(kinds))} rooms"
 
 
 def describe_departures(departures: Mapping[str, Any]) -> str:

@@ -23,6 +23,11 @@ _MOST: Mapping[str, float] = {
 }
 
 
+#: Levels of what a detector sees; all others are of motion.
+_OF_DETECTIONS = (
+    "misses", "small_misses", "false_positives", "duplicates", "swaps", "confusions", "jitter",
+    "truncation", "scores",
+)  # fmt: skip
 #: Side of a box, as a share of the image's, at which misses of small boxes have fallen to 1/e.
 SMALL_SIDE = 0.1
 
@@ -92,6 +97,15 @@ class SenseNoise:
             if not 0 <= low <= high <= most:
                 raise ValueError(
                     f"{flag} {field.name}: must be a level from 0 to {most}, or a range of them"
+                )
+
+    def check_image(self) -> None:
+        """Raises ValueError if detections err: for agents that look at an image, which does not."""
+        for name in _OF_DETECTIONS:
+            if ends(getattr(self, name))[1] > 0:
+                raise ValueError(
+                    f"--noise {name}: is of detections, and this model looks at an image, which "
+                    "stays as it is; choose noise of motion, or a model without an image"
                 )
 
     @property

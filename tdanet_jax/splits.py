@@ -27,6 +27,8 @@ SCENE_NUMBERS = {
 #: Room type of each iTHOR room.
 ITHOR_ROOMS = {f"FloorPlan{n}": room for room, numbers in SCENE_NUMBERS.items() for n in numbers}
 TRAIN_SCENES_PER_TYPE = 20
+#: What the name of a split ends with in a run with `--validation`.
+OF_VALIDATION = "-validation"
 #: `--validation` trains on the first 16 training rooms of a type and evaluates on the last 4.
 VALIDATION_TRAIN_SCENES_PER_TYPE = 16
 
@@ -168,7 +170,7 @@ def make_split(
             f"--split {text}: leaves no class to train on in {', '.join(empty)}{besides}"
         )
     return Split(
-        name=f"{name}-validation" if validation else name,
+        name=f"{name}{OF_VALIDATION}" if validation else name,
         train_scenes=tuple(train),
         eval_scenes=tuple(evaluated),
         hidden=frozenset(hidden),
@@ -210,7 +212,7 @@ def unseen_classes(name: str) -> tuple[str, ...]:
 
 def is_open(name: str) -> bool:
     """Whether a split with this name is the open-vocabulary benchmark, or its validation."""
-    return name.removesuffix("-validation") == OPEN
+    return name.removesuffix(OF_VALIDATION) == OPEN
 
 
 def in_order(classes: Iterable[str]) -> tuple[str, ...]:

@@ -338,7 +338,10 @@ class _TrainingRooms:
             size_noise=config.size_noise,
             extra=self.extra,
         )
-        return with_noise(params, rooms, sense_noise.parse(config.noise), self.words)
+        levels = sense_noise.parse(config.noise)
+        if self.spec.image is not None:
+            levels.check_image()
+        return with_noise(params, rooms, levels, self.words)
 
 
 def _without_words(tables: SceneTables, split: Split, vectors: WordVectors) -> list[str]:

@@ -233,6 +233,15 @@ def test_flags_that_change_nothing_are_named(model, network, idle) -> None:
     assert sorted(unused_flags(config, ClassVocabulary())) == sorted(idle)
 
 
+def test_training_with_wrong_detections_is_refused_to_a_model_of_images(
+    some_rooms: SceneTables, glove: WordVectors
+) -> None:
+    learner, network = LearnerConfig(noise="detector"), NetworkConfig(image="raster")
+    config = TrainConfig(model="mjolnir-r", learner=learner, network=network)
+    with pytest.raises(ValueError, match=r"^--noise misses: is of detections"):
+        make_task(config, some_rooms, glove)
+
+
 @pytest.mark.parametrize("model", ["tdanet", "ssnet", "baseline"])
 def test_size_noise_changes_nothing_for_a_model_of_images(model: str) -> None:
     network = NetworkConfig(image="raster") if model == "baseline" else NetworkConfig()

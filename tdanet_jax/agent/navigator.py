@@ -170,7 +170,10 @@ class Navigator:
             raise ValueError(f"{over}; begin one with reset(target)")
         if self.steps and (pose is None) != (self._origin is None):
             raise ValueError("pose: give one in every step of an episode, or in none")
-        measured = None if pose is None else self._measure(pose)
+        measured = None
+        if pose is not None:
+            measured = self._measure(pose)
+            pose = (float(pose[0]), float(pose[1]), float(pose[2]))  # an array is no truth value
         moved, right = self._motion(blocked, pose)
         if blocked is None and pose is not None:
             blocked = not moved
@@ -188,7 +191,7 @@ class Navigator:
             forbidden=self._forbidden, pose=measured,
         )  # fmt: skip
         self._state, self._kept, self._before, self._look = state, kept, pose, look
-        self._origin = self._origin or pose
+        self._origin = pose if self._origin is None else self._origin
         self.seen, self.decision = [found for found, _ in kept], decision
         self.steps, self._drawn = self.steps + 1, self._drawn + 1
         if decision.action == Action.DONE:
@@ -202,7 +205,7 @@ class Navigator:
         """A robot's pose in the axes of the agent's odometry."""
         if len(pose) != 3 or not all(map(math.isfinite, pose)):
             raise ValueError(f"pose {pose}: must be x, y and yaw, three finite numbers")
-        x, y, yaw = self._origin or pose
+        x, y, yaw = pose if self._origin is None else self._origin
         ahead = (pose[0] - x) * math.cos(yaw) + (pose[1] - y) * math.sin(yaw)
         left = (pose[1] - y) * math.cos(yaw) - (pose[0] - x) * math.sin(yaw)
         degrees = -math.degrees(pose[2] - yaw)

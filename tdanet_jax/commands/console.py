@@ -208,10 +208,17 @@ def check_picture(out: Path) -> None:
     check_file(out)
 
 
-def check_file(out: Path) -> None:
-    """Fails unless a file can be written at --out; an existing one will be replaced."""
+def check_file(out: Path, suffixes: Sequence[str] = ()) -> None:
+    """Fails unless a file can be written at --out; an existing one will be replaced.
+
+    Args:
+      out: the file.
+      suffixes: what its name may end in, such as .html; () is anything.
+    """
     if out.is_dir():
         fail(f"--out {out}: is a folder")
+    if suffixes and out.suffix not in suffixes:
+        fail(f"--out {out}: end it in {' or '.join(suffixes)}")
     files.check_writable(out)
 
 

@@ -13,10 +13,13 @@ import dataclasses
 import webbrowser
 from pathlib import Path
 
+from tdanet_jax import config as configs
 from tdanet_jax.commands import one_episode
 from tdanet_jax.commands.console import RunPath, check_file, console, fail, one_line_errors, parse
 from tdanet_jax.commands.one_episode import Choice
+from tdanet_jax.config import CONFIG_FILE
 from tdanet_jax.io.bundled_agents import find_run
+from tdanet_jax.targets import PAPER
 
 #: A task has rooms to train in and rooms to be tested in; these two are computed in no time.
 SMALL_ROOMS = ("FloorPlan401", "FloorPlan428")
@@ -48,19 +51,19 @@ def main(arguments: list[str] | None = None) -> None:
         command = dataclasses.replace(command, checkpoint=find_run(command.checkpoint))
         choice = Choice(scene=command.scene, target=command.target, seed=command.seed)
         one_episode.check(choice, [command.checkpoint])
-        check_file(command.out)
+        check_file(command.out, (".html", ".gif"))
         show(command, choice)
         if command.show:
             webbrowser.open(command.out.resolve().as_uri())
 
 
 def show(command: Command, choice: Choice) -> None:
-    """Plays the episode, without the tables of all 120 rooms, and writes the file."""
+    """Plays the episode, without the tables of all 120 rooms if it can, and writes the file."""
     from tdanet_jax.analysis import pictures, replay, trace
     from tdanet_jax.analysis.episode_lookup import name_ranges
     from tdanet_jax.io import files
     from tdanet_jax.scenes import floor_plan, ithor, tabulation
-    from tdanet_jax.scenes.dataset import Rooms
+    from tdanet_jax.scenes.dataset import Rooms, load_rooms
     from tdanet_jax.training import devices
 
     devices.keep_compiled()
@@ -71,13 +74,18 @@ def show(command: Command, choice: Choice) -> None:
     console.print(f"{command.checkpoint.name} looks for {command.target} ...")
     names = dict.fromkeys((command.scene, *SMALL_ROOMS))
     classes = {item.object_class for scene in scenes.values() for item in scene.objects}
-    tables = tabulation.build([scenes[name] for name in names], sorted(classes))
-    player = trace.load_player(command.checkpoint, Rooms(tables, extras=None))
-    traces = one_episode.play(choice, [command.checkpoint], [player], tables)
+    config = configs.load(command.checkpoint / CONFIG_FILE)
+    if config.sought == PAPER and not config.validation:
+        tables = tabulation.build([scenes[name] for name in names], sorted(classes))
+        rooms = Rooms(tables, extras=None)
+    else:  # its targets are found in its training rooms, and those of validation are others
+        rooms = load_rooms(None)
+    player = trace.load_player(command.checkpoint, rooms)
+    traces = one_episode.play(choice, [command.checkpoint], [player], rooms.tables)
     command.out.parent.mkdir(parents=True, exist_ok=True)
     if command.out.suffix == ".gif":
-        plan = floor_plan.of_room(tables, command.scene)
-        pictures.animation(traces, plan, tables, command.out)
+        plan = floor_plan.of_room(rooms.tables, command.scene)
+        pictures.animation(traces, plan, rooms.tables, command.out)
     else:
-        files.write_text(command.out, replay.page(traces, tables))
+        files.write_text(command.out, replay.page(traces, rooms.tables))
     one_episode.print_outcomes(traces, command.out)

@@ -28,7 +28,7 @@ def main(arguments: list[str] | None = None) -> None:
     with one_line_errors():
         command = parse(Command, arguments, prog="tdanet replay", description=__doc__)
         one_episode.check(command.choice, command.checkpoint)
-        check_file(command.out)
+        check_file(command.out, (".html",))
         from tdanet_jax.analysis import replay
         from tdanet_jax.io import files
 

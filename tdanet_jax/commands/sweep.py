@@ -39,7 +39,7 @@ from tdanet_jax.commands.running import Command as TrainingCommand
 from tdanet_jax.commands.running import how_to_continue, parse_command, stoppable
 from tdanet_jax.commands.streams import output_may_break
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
-from tdanet_jax.eval_config import OWN_TASK
+from tdanet_jax.eval_config import OWN_TASK, rooms_played
 from tdanet_jax.io import files
 from tdanet_jax.splits import file_name
 from tdanet_jax.training import cluster
@@ -350,7 +350,8 @@ def write_report(
         )
         names = {split: f"learning_curve-{file_name(split)}.png" for split in curves}
         for split, name in names.items():
-            figures.evaluated_curves(curves[split], f"Split {split}, test rooms", out / name)
+            title = f"Split {split}, {rooms_played(None, [split])}"
+            figures.evaluated_curves(curves[split], title, out / name)
         content = json.dumps(sweep_report.to_json(found), indent=2)
         files.write_text(out / "report.json", content + "\n")
         files.write_text(out / "report.md", sweep_report.markdown(found, names))
@@ -365,9 +366,11 @@ def check_alike(runs: Sequence[FinishedRun], planned: Sequence[Path] = ()) -> No
     for name in names:
         if names.count(name) > 1:
             fail(f"two runs are called {name}: rename one of the folders")
+    first: dict[str, FinishedRun] = {}
     for run in runs:
-        if run.results["data_version"] != runs[0].results["data_version"]:
-            fail(f"{run.folder}: was evaluated on other scene tables than {runs[0].folder}")
+        alike = first.setdefault(run.results["split"], run)
+        if run.results["data_version"] != alike.results["data_version"]:
+            fail(f"{run.folder}: was evaluated on other scene tables than {alike.folder}")
 
 
 def costs(runs: Sequence[FinishedRun]) -> dict[str, Cost]:

@@ -10,7 +10,6 @@ runs/<split>-<model>-seed<seed>-<time>).
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import shlex
 import sys
 import time
@@ -22,7 +21,7 @@ from tdanet_jax.commands.streams import output_may_break
 from tdanet_jax.config import TrainConfig, run_name
 from tdanet_jax.io import files
 from tdanet_jax.training import cluster
-from tdanet_jax.training.journal import SINKS
+from tdanet_jax.training.journal import check_log
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -60,10 +59,7 @@ def check(command: Command) -> TrainConfig:
         if command.out is None and cluster.several():
             fail("a run of several processes needs --out, a folder that all of them can access")
     check_positive(devices=command.devices)
-    for name in command.sinks:
-        package = SINKS[name][0]
-        if package is not None and importlib.util.find_spec(package) is None:
-            fail(f"--log {name} needs {package}: pip install {package}")
+    check_log(command.sinks)
     return config
 
 

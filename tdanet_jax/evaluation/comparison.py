@@ -230,10 +230,11 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
       runs: a short name for each; points of one run, which are not averaged, share one.
     """
     departures = results[0].get("departures") if results else None  # all are played alike
+    where = rooms_played(departures, [result["split"] for result in results])
     lines = [
         f"# {in_markdown(title)}",
         "",
-        f"SR and SPL in percent, {rooms_played(departures)}. {metrics.COLLISION_FREE}",
+        f"SR and SPL in percent, {where}. {metrics.COLLISION_FREE}",
     ]
     if departures:
         lines += ["", f"**{in_markdown(describe_departures(departures))}.**"]

@@ -9,7 +9,7 @@ from typing import Any
 from tdanet_jax.evaluation.metrics import BUCKETS, MEASURES
 from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.io.untrusted.jsons import number
-from tdanet_jax.splits import GROUPS, split_name
+from tdanet_jax.splits import GROUPS, OF_VALIDATION, split_name
 
 #: Fields of text, and counts, with what they are at most.
 _TEXTS = ("split", "model", "policy", "data_version")
@@ -37,7 +37,7 @@ def check(path: Path, results: Any) -> None:
     for name, most in _COUNTS.items():
         if number(path, results.get(name), name, most) < 0 or type(results[name]) is not int:
             raise FileError(path, f"{name} is not a count")
-    name = results["split"].removesuffix("-validation")
+    name = results["split"].removesuffix(OF_VALIDATION)
     try:
         canonical = split_name(name, None)
     except ValueError as error:

@@ -74,10 +74,11 @@ class Evaluated:
         `point` and `share` are None unless it is a point of a history.
         """
         point = None if self.saved.point is None else self.snapshot.point
+        share = None if point is None else self._share(self.saved.config, self.snapshot)
         return {
             "run": str(self.saved.run),
             "point": point,
-            "share": None if point is None else point / max(self.saved.config.history, 1),
+            "share": share,
             "updates": self.snapshot.updates,
             "training_seconds": round(self.snapshot.seconds, 1),
             **report.results(self.provenance, self.task.tables, self.played),
@@ -85,6 +86,13 @@ class Evaluated:
                 dataclasses.replace(self.saved.config, network=self.saved.located.network)
             ),
         }
+
+    @staticmethod
+    def _share(config: TrainConfig, at: Snapshot) -> float:
+        """The share of the budget at a point; of the present one, if a run has got another."""
+        points = max(config.history, 1)
+        spent = config.spent(at.updates * config.steps_per_update, at.episodes, at.seconds)
+        return at.point / points if history.due(0.0, spent, points) == at.point else spent
 
     def columns(self) -> dict[str, report.Columns]:
         """Its records by group, as named columns."""

@@ -47,7 +47,13 @@ def with_senses(task: Task, params: EnvParams, senses: Sequence[SenseNoise]) -> 
     """The environment of an evaluation with each of these noises of the senses.
 
     All have arrays of the same shapes, so that one compiled program plays them.
+
+    Raises:
+      ValueError: detections would err, but not the image that the network looks at.
     """
+    if params.spec.image is not None:
+        for noise in senses:
+            noise.check_image()
     if not any(noise.any for noise in senses):
         return [params] * len(senses)
     model = with_noise(params, task.tables, sense_noise.MIX, np.asarray(task.words)).noise

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import csv
+import hashlib
+import importlib.util
 import io
 import json
 import os
 import re
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from tdanet_jax.config import CONFIG_FILE
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import jsons
+from tdanet_jax.training import run_file
 
 METRICS_FILE = "metrics.jsonl"
 CSV_FILE = "metrics.csv"
@@ -138,7 +141,8 @@ def csv_sink(folder: Path | str) -> Callable[[Row], None]:
             return
         try:
             if there is not None:  # the first row says which columns there are
-                begin([*there, row])
+                earlier = [old for old in there if old["updates"] < row["updates"]]
+                begin([*earlier, row])  # without what came after the checkpoint, of a killed run
                 there = None
                 return
             with path.open("a", encoding="utf-8") as file:
@@ -155,7 +159,7 @@ def wandb_sink(folder: Path | str) -> Callable[[Row], None]:
     `folder`/wandb.
 
     The run is called as its folder is, in the project "tdanet_jax" unless WANDB_PROJECT is set, and
-    is continued by a run that is resumed.
+    is continued by a run that is resumed. Others in folders of the same name are runs of their own.
 
     Raises:
       ValueError: Weights & Biases refuses the run.
@@ -164,11 +168,13 @@ def wandb_sink(folder: Path | str) -> Callable[[Row], None]:
 
     folder = Path(folder)
     name = folder.resolve().name
+    first = run_file.read(folder)[:1]  # of resumed runs, too
+    mark = hashlib.sha256(repr(first).encode()).hexdigest()[:8]
     try:
         run = wandb.init(
             project=os.environ.get("WANDB_PROJECT", "tdanet_jax"),
             name=name,
-            id=re.sub(r"[^\w-]", "-", name),
+            id=re.sub(r"[^\w-]", "-", f"{name}-{mark}"),
             dir=str(folder),
             config=jsons.load(folder / CONFIG_FILE),
             resume="allow",
@@ -181,6 +187,16 @@ def wandb_sink(folder: Path | str) -> Callable[[Row], None]:
         run.log(figures, step=row["steps"])
 
     return write
+
+
+def check_log(names: Sequence[str]) -> None:
+    """Raises ValueError if a run cannot be logged in one of these, as SINKS calls them."""
+    for name in names:
+        if name not in SINKS:
+            raise ValueError(f"--log {name}: choose {', '.join(SINKS)}")
+        package = SINKS[name][0]
+        if package is not None and importlib.util.find_spec(package) is None:
+            raise ValueError(f"--log {name} needs {package}: pip install {package}")
 
 
 #: What else a run can be logged in: the package that it needs, if any, and what makes its sink.

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from tdanet_jax.analysis import figures
-from tdanet_jax.config import TrainConfig
+from tdanet_jax.config import CONFIG_FILE, TrainConfig, check_seed
 from tdanet_jax.eval_config import OWN_TASK, EvalConfig, rooms_played
 from tdanet_jax.evaluation import comparison, policies, report, rollout, saved_networks, selection
 from tdanet_jax.evaluation.policies import MakePolicy, Policy
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
 from tdanet_jax.io import files
+from tdanet_jax.io.bundled_agents import find_run
 from tdanet_jax.task import ITHOR, environment, load_task
 
 #: Policies that need no checkpoint.
@@ -65,6 +66,10 @@ def evaluate(
     folder = None if out is None else Path(out)
     if folder is not None:
         files.check_writable(folder)
+        if (folder / CONFIG_FILE).exists():
+            raise ValueError(f"{folder}: is a run, with results of its own; choose another folder")
+    if seed is not None:
+        check_seed(seed)
     test = test or OWN_TASK
     test.check()
     if data is not None:
@@ -74,7 +79,8 @@ def evaluate(
     if policy not in ("sample", "greedy"):
         raise ValueError(f"policy {policy}: a checkpoint's actions are sampled or greedy")
     single = isinstance(checkpoint, str | Path)
-    runs = [Path(checkpoint)] if isinstance(checkpoint, str | Path) else [*map(Path, checkpoint)]
+    given = [checkpoint] if isinstance(checkpoint, str | Path) else [*checkpoint]
+    runs = [find_run(run) for run in given]
     networks = [n for run in runs for n in saved_networks.find(run, history, test)]
     evaluated = saved_networks.evaluate(networks, policy == "greedy", seed)
     if single and not history:
@@ -154,7 +160,8 @@ def _write(
             for run, name in names.items()
         ]
         picture = folder / "learning_curve.png"
-        where = rooms_played(networks[0].test.departures).capitalize()
+        splits = [result["split"] for result in results]
+        where = rooms_played(networks[0].test.departures, splits).capitalize()
         figures.evaluated_curves(curves, f"{where}, while training", picture)
     files.write_text(folder / "evaluations.json", json.dumps(results, indent=2) + "\n")
 

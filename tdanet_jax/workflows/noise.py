@@ -15,6 +15,7 @@ from typing import Any
 
 from tdanet_jax import sense_noise
 from tdanet_jax.analysis import figures
+from tdanet_jax.config import check_seed
 from tdanet_jax.eval_config import OWN_TASK, EvalConfig, describe_departures, rooms_played
 from tdanet_jax.evaluation import metrics, report, results_file, saved_networks
 from tdanet_jax.evaluation.metrics import MEASURES
@@ -23,7 +24,7 @@ from tdanet_jax.io import files
 from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.sense_noise import SWEEP_FILE
-from tdanet_jax.splits import GROUPS
+from tdanet_jax.splits import GROUPS, OF_VALIDATION
 from tdanet_jax.training.history import Snapshot
 from tdanet_jax.workflows.evaluate import short_names
 
@@ -71,6 +72,8 @@ def evaluate_noise(
       BlockingIOError: another process writes to the folder.
     """
     test.check()
+    if seed is not None:
+        check_seed(seed)
     folder = None if out is None else Path(out)
     with contextlib.nullcontext() if folder is None else files.locked(folder):
         if folder is not None:
@@ -90,7 +93,9 @@ def evaluate_noise(
         ordered = [rows[i] for i in range(len(levels))]
         if folder is not None:
             files.write_text(folder / "noise.md", markdown(ordered))
-            where = rooms_played(ordered[0]["departures"])
+            configs = [level.network.config for level in levels]
+            splits = [config.split + OF_VALIDATION * config.validation for config in configs]
+            where = rooms_played(ordered[0]["departures"], splits)
             figures.noise(ordered, f"Senses that err, {where}", folder / "noise.png")
     return ordered
 

@@ -29,7 +29,7 @@ from tdanet_jax.evaluation.comparison import Result
 from tdanet_jax.evaluation.policies import Policy
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import FileError, jsons, regular
-from tdanet_jax.splits import GROUPS, NAMED, OPEN, is_open, make_split
+from tdanet_jax.splits import GROUPS, NAMED, OF_VALIDATION, OPEN, is_open, make_split
 from tdanet_jax.targets import PAPER
 from tdanet_jax.task import Task, load_task
 from tdanet_jax.training import journal, run_file
@@ -50,8 +50,6 @@ CUSTOM = "custom"
 _PLAIN = r"[\w @%+=:,./'\"-]"
 #: Folders that may name their owner: of absolute paths, of those from ~, and of those with "..".
 _FOLDERS = re.compile(r"(^|[\s=:,])(?:/|~[^\s=:,/]*|(?:[^\s=:,]*/)?\.\./)(?:[^=:,]*/)?")
-#: What the name of a split ends with in a run with `--validation`.
-_OF_VALIDATION = "-validation"
 #: Takes the actions [B, N] that are given as its weights.
 _RECORDED = Policy(
     start=lambda actions, batch: jnp.int32(0),
@@ -277,7 +275,7 @@ def check(run: Path, row: Row) -> None:
       row: what was read from it.
     """
     results, path = row.results, run / report.RESULTS_FILE
-    split, policy = results["split"].removesuffix(_OF_VALIDATION), results["policy"]
+    split, policy = results["split"].removesuffix(OF_VALIDATION), results["policy"]
     if row.of_validation != (split != results["split"]):
         name = "NAME" if row.of_validation else f"{VALIDATION}NAME"
         raise FileError(path, f"split {results['split']}: call the row {name}")

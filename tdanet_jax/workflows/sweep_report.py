@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tdanet_jax.eval_config import rooms_played
 from tdanet_jax.evaluation import comparison, paper
 from tdanet_jax.evaluation.comparison import Curve, Result, Spread
 from tdanet_jax.io.escaping import in_markdown
@@ -161,8 +162,8 @@ def markdown(report: Report, figures: Mapping[str, str]) -> str:
     lines = [
         f"# {len(report.runs)} runs",
         "",
-        "SR and SPL in percent, test rooms, sampled actions; mean ± standard deviation over the "
-        f"seeds of a configuration. Code {report.code}.",
+        f"SR and SPL in percent, {rooms_played(None, report.splits)}, sampled actions; mean ± "
+        f"standard deviation over the seeds of a configuration. Code {report.code}.",
     ]
     for split in report.splits:
         lines += _comparison(report, split)

@@ -25,7 +25,7 @@ from tdanet_jax.scenes.dataset import idle_rooms
 from tdanet_jax.task import load_task, resolve
 from tdanet_jax.training import checkpoint, devices, run_file
 from tdanet_jax.training.callbacks import Callbacks
-from tdanet_jax.training.journal import SINKS, Row, read_metrics
+from tdanet_jax.training.journal import METRICS_FILE, SINKS, Row, check_log, read_metrics
 from tdanet_jax.training.run import Run, chunks_together
 
 #: Between two looks at whether the next rooms are there.
@@ -66,6 +66,8 @@ def train(
     if tensorboard:
         warnings.warn('use log=["tensorboard"]', DeprecationWarning, stacklevel=2)
         log = [*log, "tensorboard"]
+    log = [log] if isinstance(log, str) else log
+    check_log(log)
     if resume:
         config = resumed(folder, config)
     elif config is None:
@@ -177,6 +179,9 @@ def _prepare(run: Run, callbacks: Callbacks) -> None:
         callbacks.on_note(f"removed {path}: half-written when the run was stopped")
     if run.config.word_vectors is not None and not (folder / WORD_VECTORS_FILE).exists():
         task.vectors.save_copy(folder / WORD_VECTORS_FILE, task.tables.classes)
+    if run.progress < 1.0:  # results there are of a former budget, which this run goes beyond
+        for name in (report.RESULTS_FILE, report.RESULTS_PAGE, report.EPISODES_FILE):
+            (folder / name).unlink(missing_ok=True)
     task.classes.save(folder)
     process = run_file.this_process(callbacks.command, report.code_version(), run.mesh)
     run_file.add(folder, process)
@@ -243,7 +248,11 @@ def _waits_or_stops(runs: Sequence[Run], callbacks: Callbacks) -> bool:
 
 def _report(run: Run, lists: Mapping[str, Episodes], callbacks: Callbacks) -> dict[str, Any]:
     """Evaluates a finished run; writes its learning curve and its results."""
-    figures.learning_curve(read_metrics(run.folder), run.title, run.folder / "learning_curve.png")
+    if (run.folder / METRICS_FILE).exists():
+        curve = run.folder / "learning_curve.png"
+        figures.learning_curve(read_metrics(run.folder), run.title, curve)
+    else:
+        callbacks.on_note(f"note: no {METRICS_FILE}, and so no learning curve")
     callbacks.on_note("evaluating ...")
     task, seed = run.task, run.config.seed
     policy = policies.network(run.model, task.words)

@@ -221,7 +221,7 @@ def test_a_measured_pose_is_told_relative_to_the_start(navigator):
 def test_measured_turns_move_what_is_kept(navigator):
     nav = navigator("RotateRight", "MoveAhead", "Done", keep_frames=3)
     nav.step([MUG], pose=(0, 0, 0))
-    nav.step([], pose=(0, 0, 0))  # it did not turn
+    nav.step([], pose=np.zeros(3))  # it did not turn; an array is a pose as well
     np.testing.assert_allclose(nav.agent.shown()["mug"], (0.4, 0.4, 0.6, 0.6), atol=1e-9)
     nav.step([], pose=(0.25, 0, 0))
     assert nav.agent.shown() == {}

@@ -142,6 +142,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint nowhere", "nowhere/config.json: no such file"),
         ("--seed=-1", "--seed -1: must be between 0 and 4294967295"),
         ("--out full", "--out full: is a folder"),
+        ("--out laptop.png", "--out laptop.png: end it in .html or .gif"),
     ],
     "serve": [
         ("", "Missing from tdanet serve: --checkpoint RUN"),
@@ -163,6 +164,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint bare --episode 3 --scene X", "--episode takes no --scene, --target or"),
         ("--checkpoint bare --scene FloorPlan1 --target Mug", "bare/checkpoints: no checkpoint"),
         ("--checkpoint bare --episode 3 --out full", "--out full: is a folder"),
+        ("--checkpoint bare --episode 3 --out x.gif", "--out x.gif: end it in .html"),
         ("--checkpoint bare --episode 3 --out full/file/a", "--out full/file/a: Not a directory"),
         ("--checkpoint bare --episode x", "invalid literal for int() with base 10: 'x'"),
         ("--checkpoint bare --episode 3 --seed=-1", "--seed -1: must be between 0 and 4294967295"),

@@ -16,12 +16,14 @@ from tdanet_jax.commands import evaluate
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.evaluation import report, saved_networks
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
+from tdanet_jax.io import bundled_agents
 from tdanet_jax.io.files import check_empty
 from tdanet_jax.task import make_task
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
 from tdanet_jax.vocabulary import ROOM_TYPES
 from tdanet_jax.workflows.evaluate import short_names
+from tdanet_jax.workflows.noise import evaluate_noise
 from tests.conftest import save_untrained
 from tests.evaluation.test_comparison import result as made_up
 from tests.support import samples
@@ -90,7 +92,7 @@ def test_the_history_of_two_runs_gives_a_curve_and_all_records(runs, few_episode
 
 
 def test_two_runs_are_compared_episode_by_episode(
-    opinionated_run, rooms_file, few_episodes, tmp_path
+    opinionated_run, rooms_file, few_episodes, tmp_path, monkeypatch
 ):
     """Another seed of sampled actions, and the very same agent under another name."""
     copies = []
@@ -116,6 +118,23 @@ def test_two_runs_are_compared_episode_by_episode(
     cells = " | ".join(["0.0 (0.0 to 0.0)"] * 8)
     assert f"| again minus {opinionated_run.name} |  |  | sample | {cells} |" in page
     assert f"| seed1 minus {opinionated_run.name} |" in page
+    # From Python, and as bundled agents, by their names.
+    monkeypatch.setattr(bundled_agents, "folder", lambda: tmp_path)
+    out, names = tmp_path / "by name", ["seed1", "again"]
+    ours = tdanet_jax.evaluate(names, data=str(rooms_file), out=out)
+    assert [row["seen"] for row in ours] == [other["seen"], same["seen"]]
+    assert "| again minus seed1 |" in (out / "evaluations.md").read_text()
+
+
+def test_a_run_is_no_folder_for_other_results(opinionated_run):
+    with pytest.raises(ValueError, match="is a run, with results of its own; choose another"):
+        tdanet_jax.evaluate(opinionated_run, policy="greedy", out=opinionated_run)
+
+
+@pytest.mark.parametrize("play", [tdanet_jax.evaluate, evaluate_noise])
+def test_a_seed_must_be_one(opinionated_run, play):
+    with pytest.raises(ValueError, match="--seed -1: must be between 0 and 4294967295"):
+        play([opinionated_run], seed=-1)
 
 
 def test_one_run_gives_the_files_of_a_single_result_beside_it(ithor, glove, few_episodes, tmp_path):
@@ -193,12 +212,21 @@ def test_a_custom_policy_as_the_page_shows_it(ithor, few_episodes, capsys):
     assert names["results"]["policy"] == "custom"
 
 
-@pytest.mark.parametrize(("point", "share"), [(None, None), (Path("history/00000040.npz"), 0.25)])
-def test_only_a_point_of_a_history_has_a_share_of_the_budget(tmp_path, point, share):
+@pytest.mark.parametrize(
+    ("steps", "point", "share"),
+    [
+        (6400, None, None),
+        (6400, Path("history/00000040.npz"), 0.25),  # point 5 of 20
+        (12800, Path("history/00000040.npz"), 0.125),  # it was, of a budget half as large
+    ],
+)
+def test_only_a_point_of_a_history_has_a_share_of_the_budget(tmp_path, steps, point, share):
     snapshot = Snapshot(None, 40, 100, 1.0, 0 if point is None else 5, "d")
+    config = dataclasses.replace(TINY, steps=steps)
+    assert config.steps_per_update * 40 == 1600
     provenance = report.Provenance("18/4", "tdanet", "sample", 100, 0, 0, 1600, "d")
     done = saved_networks.Evaluated(
-        SavedNetwork(tmp_path, TINY, point),
+        SavedNetwork(tmp_path, config, point),
         snapshot,
         SimpleNamespace(tables=SimpleNamespace(room_types=ROOM_TYPES, targets=())),
         provenance,

@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import json
 import re
+import shutil
 import subprocess
 import sys
 
@@ -13,8 +14,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tdanet_jax.commands import attention, evaluate, failures, replay, trajectories
+from tdanet_jax import config as configs
+from tdanet_jax.commands import attention, demo, evaluate, failures, replay, trajectories
 from tdanet_jax.commands.one_episode import Choice
+from tdanet_jax.config import CONFIG_FILE
 from tdanet_jax.evaluation import episodes
 from tdanet_jax.scenes import dataset
 from tdanet_jax.scenes.offline import importer
@@ -276,3 +279,15 @@ def test_failures_of_a_point_of_the_history_are_refused(tmp_path, capsys, opinio
     with pytest.raises(SystemExit):
         failures.main(["--checkpoint", str(point), "--out", str(tmp_path / "out")])
     assert "give the run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "changed", [{"validation": True}, {"targets": "Kettle,Mug,Book"}, {"split": "open"}]
+)
+def test_the_demo_shows_any_run(opinionated_run, tmp_path, changed):
+    """Its rooms for training and validation, and its targets, need not be the paper's."""
+    run, page = shutil.copytree(opinionated_run, tmp_path / "run"), tmp_path / "page.html"
+    configs.save(dataclasses.replace(TINY, **changed), run / CONFIG_FILE)
+    demo.main(["--checkpoint", str(run), "--no-show", "--out", str(page), "--target", "Mug",
+               "--scene", "FloorPlan305"])  # fmt: skip
+    assert "FloorPlan305" in page.read_text()

@@ -17,6 +17,7 @@ from tdanet_jax import config as configs
 from tdanet_jax.commands import evaluate, sweep
 from tdanet_jax.config import LearnerConfig
 from tdanet_jax.io import files
+from tdanet_jax.workflows.sweep import FinishedRun
 from tdanet_jax.workflows.sweep_report import Cost
 from tests.evaluation.test_comparison import result
 from tests.support import command
@@ -143,6 +144,22 @@ def test_what_cannot_stand_in_one_report_shows_before_anything_is_trained(tmp_pa
         sweep.main(["--seeds", "2", "--steps", "1", "--out", str(out), "--include", str(elsewhere)])
     assert "evaluated on other scene tables than" in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ["18-4-tdanet-seed1"]
+
+
+def test_the_open_split_has_tables_of_its_own_and_stands_in_one_report_with_others(
+    tmp_path, capsys
+):
+    runs = []
+    for split, seed, version in (("18/4", 0, "d"), ("open", 0, "e"), ("open", 1, "e")):
+        config = dataclasses.replace(BASE, split=split, seed=seed)
+        results = result(seed) | {"split": split, "data_version": version}
+        folder = made(tmp_path / "runs", config, results)
+        runs.append(FinishedRun(folder, config, results, seconds=1.0))
+    sweep.check_alike(runs)
+    other = dataclasses.replace(runs[2], results=runs[2].results | {"data_version": "f"})
+    with pytest.raises(SystemExit):
+        sweep.check_alike([*runs[:2], other])
+    assert "open-tdanet-seed1: was evaluated on other scene tables" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

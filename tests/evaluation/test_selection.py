@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import tdanet_jax
-from tdanet_jax import EvalConfig
+from tdanet_jax import EvalConfig, sense_noise
 from tdanet_jax.commands import evaluate
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.decisions import Decisions
@@ -21,7 +21,9 @@ from tdanet_jax.env.params import TEST_STEP_LIMITS
 from tdanet_jax.eval_config import OWN_TASK, describe_departures
 from tdanet_jax.evaluation import comparison, episodes, selection
 from tdanet_jax.evaluation.episodes import Episodes
+from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.scenes import SceneTables
+from tdanet_jax.sense_noise import SenseNoise
 from tdanet_jax.splits import make_split
 from tdanet_jax.words import WordVectors
 from tests.conftest import TINY, save_untrained
@@ -270,3 +272,33 @@ def test_a_page_on_several_networks_says_so_too() -> None:
     page = comparison.markdown("2 checkpoints", [result, result], ["a", "b"])
     assert "SR and SPL in percent, training rooms." in page
     assert "test rooms" not in page
+    result |= {"departures": None, "split": "18/4-validation"}
+    page = comparison.markdown("2 checkpoints", [result, result], ["a", "b"])
+    assert "SR and SPL in percent, validation rooms." in page
+    assert "test rooms" not in page
+    other = {**result, "split": "14/8"}
+    page = comparison.markdown("2 checkpoints", [result, other], ["a", "b"])
+    assert "SR and SPL in percent, test and validation rooms." in page
+
+
+@pytest.mark.parametrize("noise", ["detector", "mix", "misses=0:0.1", "truncation=0.1", "scores=1"])
+def test_what_a_detector_gets_wrong_is_refused_to_models_that_look_at_an_image(noise: str) -> None:
+    """The image stays as it is, so results would be those without noise, called noisy."""
+    task, levels = SimpleNamespace(), sense_noise.parse(noise)
+    params = SimpleNamespace(spec=ObservationSpec(image="raster"), replace=None)
+    with pytest.raises(ValueError, match=r"^--noise [a-z_]+: is of detections, and"):
+        selection.with_senses(task, params, [sense_noise.NONE, levels])
+
+
+def test_only_noise_of_motion_is_left_to_models_that_look_at_an_image() -> None:
+    motion = {
+        "distance_bias", "distance_noise", "turn_bias", "turn_noise", "heading_drift",
+        "heading_error", "short_steps", "failed_turns",
+    }  # fmt: skip
+    for field in dataclasses.fields(SenseNoise):
+        noise = SenseNoise(**{field.name: 0.1})
+        if field.name in motion:
+            noise.check_image()
+        else:
+            with pytest.raises(ValueError, match=f"^--noise {field.name}: is of detections"):
+                noise.check_image()

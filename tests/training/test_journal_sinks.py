@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -13,7 +14,11 @@ import pytest
 
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
-from tdanet_jax.training.journal import Journal, csv_sink, wandb_sink
+from tdanet_jax.training import journal as journal_module
+from tdanet_jax.training import run_file
+from tdanet_jax.training.journal import SINKS, Journal, csv_sink, wandb_sink
+from tdanet_jax.training.run_file import Process
+from tdanet_jax.workflows.train import train
 
 
 def row(number: int, success: float | None = 0.5) -> dict[str, Any]:
@@ -50,6 +55,19 @@ def test_a_table_has_the_columns_of_rows_that_an_earlier_version_wrote(tmp_path:
         {"updates": str(n), "steps": str(40 * n), "episodes": str(n), "success": s, "share": more}
         for n, s, more in ((1, "0.5", ""), (2, "0.75", "0.25"), (3, "0.75", "0.25"))
     ]
+
+
+def test_a_table_has_no_rows_of_a_killed_run_after_its_checkpoint(tmp_path: Path) -> None:
+    """A run makes its tables before it drops these rows."""
+    journal = Journal(tmp_path / "metrics.jsonl", 0)
+    for number in (1, 2, 3, 4):
+        journal.write(row(number, 0.25))
+    sink = csv_sink(tmp_path)
+    for number in (3, 4):  # its checkpoint is that of row 2
+        sink(row(number, 0.75))
+    assert [(r["updates"], r["success"]) for r in table(tmp_path)] == [
+        ("1", "0.25"), ("2", "0.25"), ("3", "0.75"), ("4", "0.75"),
+    ]  # fmt: skip
 
 
 def test_training_goes_on_without_a_table(tmp_path: Path) -> None:
@@ -92,11 +110,48 @@ def test_weights_and_biases_get_the_run_and_every_figure(
     sink = wandb_sink(folder)
     sink(row(2, None))
     assert fake.logged == [(80, {"train/updates": 2, "train/steps": 80, "train/episodes": 2})]
+    name = fake.begun.pop("id")
+    assert re.fullmatch(r"my-run-[0-9a-f]{8}", name)
     assert fake.begun == {
-        "project": "tdanet_jax", "name": "my run", "id": "my-run", "dir": str(folder),
+        "project": "tdanet_jax", "name": "my run", "dir": str(folder),
         "config": json.loads((folder / CONFIG_FILE).read_text()), "resume": "allow",
     }  # fmt: skip
     assert fake.begun["config"]["seed"] == 7
+
+
+def test_weights_and_biases_go_on_with_a_run_and_tell_apart_those_of_one_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake = Wandb()
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    names = []
+    for folder, started in (("a/mine", "1"), ("b/mine", "2"), ("b/mine", "3")):
+        (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+        configs.save(TrainConfig(), tmp_path / folder / CONFIG_FILE)
+        run_file.add(tmp_path / folder, Process(started=started))  # of b/mine, the second resumes
+        wandb_sink(tmp_path / folder)
+        names.append(fake.begun["id"])
+    assert names[0] != names[1] == names[2]
+
+
+@pytest.mark.parametrize(
+    ("names", "error"),
+    [
+        (["tensorbord"], "--log tensorbord: choose tensorboard, wandb, csv"),
+        (
+            ["csv", "wandb"],
+            "--log wandb needs nowhere: pip install nowhere",
+        ),
+    ],
+)
+def test_what_a_run_cannot_be_logged_in_is_one_line_before_it_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, names: list[str], error: str
+) -> None:
+    missing = {**SINKS, "wandb": ("nowhere", wandb_sink)}
+    monkeypatch.setattr(journal_module, "SINKS", missing)
+    with pytest.raises(ValueError, match=f"^{error}$"):
+        train(TrainConfig(), tmp_path / "run", log=names)
+    assert not (tmp_path / "run").exists()
 
 
 def test_what_weights_and_biases_refuse_is_one_line(

@@ -14,8 +14,11 @@ import pytest
 
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.evaluation import report as report_module
+from tdanet_jax.evaluation import rollout
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.task import Task, make_task
+from tdanet_jax.training.callbacks import Callbacks
 from tdanet_jax.training.checkpoint import Checkpoints
 from tdanet_jax.training.journal import read_metrics
 from tdanet_jax.training.learner import TrainState
@@ -23,6 +26,8 @@ from tdanet_jax.training.run import _UPDATE_MEANS, Run
 from tdanet_jax.vocabulary import ACTION_NAMES
 from tdanet_jax.words import WordVectors
 from tdanet_jax.workflows.train import _check_longer as check_longer
+from tdanet_jax.workflows.train import _prepare as prepare
+from tdanet_jax.workflows.train import _report as evaluate_finished
 
 CONFIG = TrainConfig(
     minutes=10.0,
@@ -124,3 +129,39 @@ def test_a_budget_that_is_spent_already_is_refused(task: Task, tmp_path: Path) -
     run.config = dataclasses.replace(CONFIG, minutes=5.0)
     with pytest.raises(ValueError, match=r"--minutes 5.0: .* has already trained as long"):
         check_longer(run)
+
+
+RESULTS = ("results.json", "results.md", "episodes.jsonl")
+
+
+@pytest.mark.parametrize("steps", [10, 20])
+def test_results_of_a_former_budget_are_not_those_of_a_longer_run(
+    task: Task, tmp_path: Path, steps: int
+) -> None:
+    """A sweep takes a run with results for finished, and `share` passes them on."""
+    run = Run(tmp_path, dataclasses.replace(CONFIG, minutes=None, steps=10), task)
+    run.state = run.state.replace(updates=jnp.int32(1))  # 10 steps
+    for name in RESULTS:
+        (tmp_path / name).write_text("of 10 steps")
+    run.config = dataclasses.replace(run.config, steps=steps)
+    prepare(run, Callbacks())
+    assert [name for name in RESULTS if (tmp_path / name).exists()] == [
+        name for name in RESULTS if steps == 10
+    ]
+
+
+def test_a_run_without_its_metrics_is_evaluated_all_the_same(
+    task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+
+    class Noting(Callbacks):
+        def on_note(self, text: str) -> None:
+            said.append(text)
+
+    monkeypatch.setattr(rollout, "evaluate_lists", lambda *_: {})
+    monkeypatch.setattr(report_module, "results", lambda *_: {"found": True})
+    found = evaluate_finished(Run(tmp_path, CONFIG, task), {}, Noting())
+    assert found == {"found": True}
+    assert said[0] == "note: no metrics.jsonl, and so no learning curve"
+    assert not (tmp_path / "learning_curve.png").exists()
