@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tdanet_jax import sense_noise
-from tdanet_jax.config import TrainConfig, find_word_vectors, fits, with_decisions
+from tdanet_jax.config import TrainConfig, check_seed, find_word_vectors, fits, with_decisions
 from tdanet_jax.decisions import OWN_DECISIONS, Decisions
 from tdanet_jax.sense_noise import SenseNoise
 from tdanet_jax.splits import OF_VALIDATION, OPEN
@@ -46,9 +46,18 @@ class EvalConfig:
     decisions: Decisions = OWN_DECISIONS
     """How the agent decides, instead of as its run says."""
 
-    def check(self) -> None:
-        """Raises ValueError, with one line that names the flag, if a value is out of range."""
+    def check(self, policy: object = None, seed: int | None = None) -> None:
+        """Raises ValueError, with one line that names the flag, if a value is out of range.
+
+        Args:
+          policy: how actions are chosen; "greedy" has no temperature.
+          seed: of sampled actions.
+        """
         self.decisions.check()
+        if policy == "greedy" and self.decisions.temperature is not None:
+            raise ValueError("--temperature: has no effect on --policy greedy")
+        if seed is not None:
+            check_seed(seed)
         for name, value in (("step-limit", self.step_limit), ("episodes", self.episodes)):
             if value is not None and (not fits(value, int) or value < 1):
                 raise ValueError(f"--{name} {value}: must be a positive integer")

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import tdanet_jax
+from tdanet_jax import task as task_module
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.env import dynamics
 from tdanet_jax.models.classes import ClassVocabulary
@@ -19,7 +21,7 @@ from tdanet_jax.registry import MODELS
 from tdanet_jax.scenes.offline.features import features_path
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.splits import make_split
-from tdanet_jax.task import make_task, resolve
+from tdanet_jax.task import Task, make_task, resolve
 from tdanet_jax.words import WordVectors
 
 SMALL = NetworkConfig(width=8, hidden=4, precision="float32")
@@ -249,3 +251,22 @@ def test_size_noise_changes_nothing_for_a_model_of_images(model: str) -> None:
         config = TrainConfig(model=model, network=network, learner=LearnerConfig(size_noise=noise))
         idle = ["--size-noise"] if noise and model == "baseline" else []
         assert unused_flags(config, ClassVocabulary()) == idle
+
+
+def test_the_rooms_of_tests_are_loaded_with_those_added_to_training(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """These may have more in view, and observations in both have as many rows."""
+    loaded: list[TrainConfig] = []
+
+    def load(config: TrainConfig) -> Task:
+        loaded.append(config)
+        raise InterruptedError
+
+    monkeypatch.setattr(task_module, "load_task", load)
+    for split in ("train", "test"):
+        with pytest.raises(InterruptedError):
+            tdanet_jax.make("ithor-18/4", split, TrainConfig(generated=1000, variants=2))
+    train, test = loaded
+    assert train == test
+    assert (test.generated, test.variants) == (1000, 2)

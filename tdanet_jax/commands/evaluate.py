@@ -75,8 +75,6 @@ def main(arguments: list[str] | None = None) -> None:
             fail(f"--policy {command.policy} takes no --checkpoint")
         if not trained and command.history:
             fail(f"--policy {command.policy} has no --history")
-        if command.policy == "greedy" and command.test.decisions.temperature is not None:
-            fail("--temperature: has no effect on --policy greedy")
         if trained and command.split is not None:
             fail(f"--split {command.split}: a run is evaluated on its own split")
         if trained and command.validation:

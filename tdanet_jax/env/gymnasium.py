@@ -96,7 +96,7 @@ class NavigationEnv(gymnasium.Env):
       name: of an environment, as `tdanet_jax.make` takes it: "ithor-18/4".
       split: "train" or "test" rooms.
       flat: observations are vectors with word vectors filled in (`FlatObservations`), or else
-        dictionaries: class indices, boxes, mask and target.
+        dictionaries: class indices, boxes, mask and target, without further sensors.
       config: what else can be set, as `tdanet_jax.make` takes it.
 
     Raises:

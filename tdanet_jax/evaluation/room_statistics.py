@@ -12,8 +12,9 @@ from tdanet_jax.env.reward import NEAR, PARENT_CANDIDATES, nearest_distances, no
 from tdanet_jax.evaluation import episodes, policies, rollout
 from tdanet_jax.evaluation.metrics import spl
 from tdanet_jax.observation_spec import ObservationSpec
+from tdanet_jax.scenes.dataset import Rooms, find_targets
 from tdanet_jax.scenes.tables import SceneTables
-from tdanet_jax.vocabulary import TARGETS
+from tdanet_jax.targets import PAPER
 
 #: Episodes of each room type, of which L and the random agent's SR are.
 EPISODES = 1000
@@ -39,6 +40,7 @@ def statistics(tables: SceneTables) -> dict[str, str]:
     greatest = np.zeros((rooms, len(tables.targets)), bool)
     np.logical_or.at(greatest, tables.position_scene, tables.reachable)
     gaps = _distances(tables)
+    some = len(gaps) > 0
     return {
         "rooms": f"{rooms:,}",
         "reachable points in a room": f"{len(tables.position) / rooms:.1f}",
@@ -48,8 +50,10 @@ def statistics(tables: SceneTables) -> dict[str, str]:
         "  at most": f"{counts.max()}",
         "classes in a state": f"{np.mean(seen):.2f}",
         "states with a target within reach": f"{100 * (tables.distance == 0).any(1).mean():.1f} %",
-        "nearest target and furniture, median distance": f"{np.median(gaps):.2f} m",
-        f"  within {NEAR} m": f"{100 * (gaps <= NEAR).mean():.1f} %",
+        "nearest target and furniture, median distance": f"{np.median(gaps):.2f} m"
+        if some
+        else "-",
+        f"  within {NEAR} m": f"{100 * (gaps <= NEAR).mean():.1f} %" if some else "-",
         **_episodes(tables),
     }
 
@@ -70,9 +74,10 @@ def _distances(tables: SceneTables) -> np.ndarray:
 
 def _episodes(tables: SceneTables) -> dict[str, str]:
     """L, and how often a uniformly random agent succeeds."""
+    asked = find_targets(PAPER, Rooms(tables, extras=None))[1]  # in room types of one's own, too
     targets = {
         room: tuple(name for name in names if name in tables.targets)
-        for room, names in TARGETS.items()
+        for room, names in asked.items()
     }
     params = make_params(
         tables, targets, no_parents(tables), limits_of_tests(tables), ObservationSpec()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tdanet_jax.analysis import figures
-from tdanet_jax.config import CONFIG_FILE, TrainConfig, check_seed
+from tdanet_jax.config import CONFIG_FILE, TrainConfig
 from tdanet_jax.eval_config import OWN_TASK, EvalConfig, rooms_played
 from tdanet_jax.evaluation import comparison, policies, report, rollout, saved_networks, selection
 from tdanet_jax.evaluation.policies import MakePolicy, Policy
@@ -68,10 +68,8 @@ def evaluate(
         files.check_writable(folder)
         if (folder / CONFIG_FILE).exists():
             raise ValueError(f"{folder}: is a run, with results of its own; choose another folder")
-    if seed is not None:
-        check_seed(seed)
     test = test or OWN_TASK
-    test.check()
+    test.check(policy, seed)
     if data is not None:
         test = dataclasses.replace(test, data=data)
     if checkpoint is None:

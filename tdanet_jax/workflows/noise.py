@@ -15,7 +15,6 @@ from typing import Any
 
 from tdanet_jax import sense_noise
 from tdanet_jax.analysis import figures
-from tdanet_jax.config import check_seed
 from tdanet_jax.eval_config import OWN_TASK, EvalConfig, describe_departures, rooms_played
 from tdanet_jax.evaluation import metrics, report, results_file, saved_networks
 from tdanet_jax.evaluation.metrics import MEASURES
@@ -71,9 +70,7 @@ def evaluate_noise(
         same agents, episodes, rooms and seed.
       BlockingIOError: another process writes to the folder.
     """
-    test.check()
-    if seed is not None:
-        check_seed(seed)
+    test.check(policy, seed)
     folder = None if out is None else Path(out)
     with contextlib.nullcontext() if folder is None else files.locked(folder):
         if folder is not None:

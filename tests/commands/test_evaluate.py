@@ -14,6 +14,8 @@ import tdanet_jax
 from tdanet_jax import config as configs
 from tdanet_jax.commands import evaluate
 from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
+from tdanet_jax.decisions import Decisions
+from tdanet_jax.eval_config import EvalConfig
 from tdanet_jax.evaluation import report, saved_networks
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
 from tdanet_jax.io import bundled_agents
@@ -132,9 +134,12 @@ def test_a_run_is_no_folder_for_other_results(opinionated_run):
 
 
 @pytest.mark.parametrize("play", [tdanet_jax.evaluate, evaluate_noise])
-def test_a_seed_must_be_one(opinionated_run, play):
+def test_seeds_and_decisions_are_checked_before_anything_is_played(opinionated_run, play):
     with pytest.raises(ValueError, match="--seed -1: must be between 0 and 4294967295"):
         play([opinionated_run], seed=-1)
+    colder = EvalConfig(decisions=Decisions(temperature=0.5))
+    with pytest.raises(ValueError, match="--temperature: has no effect on --policy greedy"):
+        play([opinionated_run], "greedy", test=colder)
 
 
 def test_one_run_gives_the_files_of_a_single_result_beside_it(ithor, glove, few_episodes, tmp_path):

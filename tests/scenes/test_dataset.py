@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tdanet_jax.evaluation import room_statistics
 from tdanet_jax.io import archive
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.poses import PoseGrid
@@ -400,3 +401,13 @@ def test_other_archives(rooms: SceneTables, tmp_path: Path) -> None:
     path.write_text("{}")
     with pytest.raises(FileError, match=r"rooms\.npz: not an npz archive"):
         dataset.load_rooms(path)
+
+
+def test_rooms_of_a_type_of_ones_own_are_described() -> None:
+    """Their episodes, too, which have the targets that they hold."""
+    mug = toy.thing("Mug", (0.2, toy.CAMERA, 2.0))
+    room = dataclasses.replace(toy.room(toy.line(8), mug, name="A1"), room_type="office")
+    found = room_statistics.statistics(tabulation.build([room]).with_known_targets())
+    assert float(found["L, mean"]) >= 1
+    assert found["nearest target and furniture, median distance"] == "-"  # there is no furniture
+    assert found["target classes that can be found in a room"] == "1.00"
