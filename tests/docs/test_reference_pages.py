@@ -153,6 +153,29 @@ def test_means_of_the_seeds_on_split_14_8() -> None:
         assert mean == f"{statistics.fmean(rates):.1f}"
 
 
+def test_figures_of_the_agent_of_the_open_benchmark() -> None:
+    found = json.loads((ROOT / "results/open-best-half-0/results.json").read_text())
+    told = " ".join(section("results", "The open-vocabulary benchmark").split())
+    seen, unseen = (found[group]["L>=5"] for group in ("seen", "unseen"))
+    assert (
+        f"For L >= 5, seen SR is {seen['SR']:.1f} and SPL {seen['SPL']:.1f}, unseen "
+        f"{unseen['SR']:.1f} and {unseen['SPL']:.1f}."
+    ) in told
+    rates = {
+        name: groups["unseen"]["L>=1"]["SR"]
+        for name, groups in found["by_target"].items()
+        if groups.get("unseen")
+    }
+    rare = sorted((name for name, rate in rates.items() if rate < 90), key=lambda n: -rates[n])
+    assert (len(rates), len(rare)) == (19, 4)
+    *first, last = (f"{name} ({rates[name]:.0f} %)" for name in rare)
+    assert f"The other four are {', '.join(first)} and {last}." in told
+    everywhere = f"{found['unseen']['L>=1']['SR']:.0f} %"
+    assert f"`open-best` finds them in {everywhere} of" in " ".join(
+        (ROOT / "README.md").read_text().split()
+    )
+
+
 def test_the_pages_show_no_path_of_anybody() -> None:
     for page in PAGES:
         assert not re.search(r"/(home|tmp|root|work)/", text(page)), page
