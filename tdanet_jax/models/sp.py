@@ -20,10 +20,19 @@ from tdanet_jax.config import NetworkConfig
 from tdanet_jax.env.types import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary
-from tdanet_jax.models.layers import Linear, nonnegative_init
+from tdanet_jax.models.layers import Linear
 from tdanet_jax.models.shared import graph_convolutions
 from tdanet_jax.models.shared.graph_convolutions import Convolutions
 from tdanet_jax.models.shared.image import ImageEncoder, ImageTable
+
+
+def _mean_init(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """A non-negative kernel that begins near the mean of its inputs.
+
+    Inputs are non-negative, too, and do not cancel out: hundreds of them with the weights of
+    `nonnegative_init` give twenty times as much, which saturates the LSTM.
+    """
+    return jax.random.uniform(key, shape, maxval=2.0 / shape[0])
 
 
 class ScenePriorsTable(struct.PyTreeNode):
@@ -57,7 +66,7 @@ class ScenePriorsEncoder(ImageEncoder):
         self.convolution_seen = Linear(self.width, kernel_init=init, use_bias=False)
         self.convolution_words = Linear(self.width, kernel_init=init, use_bias=False)
         self.kernel1 = self.param("kernel1", init, (self.width, self.width))
-        self.kernel2 = self.param("kernel2", nonnegative_init, (self.width, 1))
+        self.kernel2 = self.param("kernel2", _mean_init, (self.width, 1))
         self.mapping = Linear(self.features)
 
     def prepare(self, words: jax.Array) -> ScenePriorsTable:

@@ -115,3 +115,16 @@ def test_the_published_size() -> None:
     layers = [(1001, 512), (301, 512), (1024, 1024), (1024, 1024), (1024, 1), (n + 1, 512)]
     size = sum(np.prod(leaf.shape) for leaf in jax.tree.leaves(shapes))
     assert size == sum(a * b for a, b in layers) - 512 * (1000 - n)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_graph_begins_as_loud_as_the_image(seed: int) -> None:
+    """Twenty times as loud, it saturated the LSTM, and a run of a million steps learned nothing."""
+    encoder = ENCODER.copy(features=64, width=256)
+
+    def both(module: ScenePriorsEncoder) -> jax.Array:
+        return module(module.prepare(WORDS), frames(), ACTION)
+
+    found, _ = encoder.init_with_output(jax.random.key(seed), method=both)
+    image, graph = (np.abs(part).mean() for part in (found[..., :-64], found[..., -64:]))
+    assert 0.1 < graph / image < 3
