@@ -48,6 +48,7 @@ class NavigatorNode(Node):
         self.names = [*filter(None, self.declare_parameter("names", [""]).value)] or None
         self.nav: Navigator | None = None
         self.info = self.pose = None
+        self.moving = False  # whether an action is under way
         self.since: Time | None = None  # when the last action ended; None while one is under way
         self.actions = self.create_publisher(String, "action", 10)
         self.create_subscription(String, "target", self.on_target, 10)
@@ -83,10 +84,11 @@ class NavigatorNode(Node):
         except LabelError as error:
             self.get_logger().error(str(error))
             return
-        self.since = self.get_clock().now()
+        self.since = None if self.moving else self.get_clock().now()
 
     def on_action_done(self, _: Empty) -> None:
         """From now on, frames show what the action has led to."""
+        self.moving = False
         if self.nav is not None and self.nav.target and not self.nav.finished:
             self.since = self.get_clock().now()
 
@@ -100,7 +102,7 @@ class NavigatorNode(Node):
         except ValueError as error:
             self.get_logger().error(str(error))
             return
-        self.since = None
+        self.since, self.moving = None, action != "Done"
         self.actions.publish(String(data=action))
         if self.nav.finished:
             self.get_logger().info(f"{self.nav.target}: {self.nav.outcome}")

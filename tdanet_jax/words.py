@@ -224,11 +224,18 @@ def _load_text(path: Path, wanted: Collection[str] | None = None) -> WordVectors
         if file.read(3) != codecs.BOM_UTF8:
             file.seek(0)
         for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b"")):
-            word = line.partition(b" ")[0].decode("utf-8", "replace")
-            if wanted is not None and number >= ASSET_WORDS and word not in wanted:
+            head = line.split(maxsplit=1)[0] if line.strip() else b""
+            if _is_left_out(head, number, wanted):
+                continue
+            # Some words of GloVe 840B hold spaces: ". . ." or "at name@domain.com".
+            parts = line.rsplit(maxsplit=len(rows[0])) if rows else line.split()
+            word = b"".join(parts[:1]).decode("utf-8", "replace")
+            if _is_left_out(b"".join(parts[:1]), number, wanted):
                 continue
             try:
-                row = np.array(line.split()[1:], np.float32)
+                row = np.array(parts[1:], np.float32)
+                if any(map(_is_number, word.split()[1:])):
+                    raise ValueError
             except ValueError:
                 raise FileError(path, f"line {number + 1} is not a word and its numbers") from None
             if number == 0 and len(row) == 1:
@@ -243,6 +250,23 @@ def _load_text(path: Path, wanted: Collection[str] | None = None) -> WordVectors
     if not rows:
         raise FileError(path, "no word vectors")
     return WordVectors(index, np.stack(rows))
+
+
+def _is_left_out(word: bytes, number: int, wanted: Collection[str] | None) -> bool:
+    """Whether a word, which is so far down in its file, is not taken."""
+    return (
+        wanted is not None
+        and number >= ASSET_WORDS
+        and word.decode("utf-8", "replace") not in wanted
+    )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _load_hdf5(path: Path) -> WordVectors:

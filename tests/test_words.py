@@ -166,9 +166,25 @@ def test_npz_files_of_vectors(tmp_path: Path) -> None:
             words.load_word_vectors(path)
 
 
+@pytest.mark.parametrize("gap", [" ", "\t"])
+def test_words_with_spaces_and_other_gaps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gap: str
+) -> None:
+    """GloVe 840B has words such as ". . ." and "at name@domain.com"."""
+    path = tmp_path / "glove.txt"
+    rows = (("the", 1, 2), (". . .", 3, 4), ("at name@domain.com", 5, 6), ("mug", 7, 8))
+    path.write_text("".join(f"{word}{gap}{x}{gap}{y}\n" for word, x, y in rows))
+    found = words.load_word_vectors(path)
+    assert [*found.index] == ["the", ". . .", "at name@domain.com", "mug"]
+    np.testing.assert_array_equal(found.vectors, [[1, 2], [3, 4], [5, 6], [7, 8]])
+    monkeypatch.setattr(words, "ASSET_WORDS", 1)
+    assert {*words.load_word_vectors(path, ["Mug"]).index} == {"the", "mug"}
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
-    [("", "no word vectors"), ("a 1 2\nb 1\n", "line 2 is not"), ("a 1 x\n", "line 1 is not"),
+    [("a 1 2\nb 1 2 3\n", "line 2 is not"), ("", "no word vectors"),
+     ("a 1 2\nb 1\n", "line 2 is not"), ("a 1 x\n", "line 1 is not"),
      ("a 1 nan\n", "line 1 is not"), ("a\n", "line 1 is not")],
 )  # fmt: skip
 def test_text_files_without_vectors(tmp_path: Path, text: str, reason: str) -> None:

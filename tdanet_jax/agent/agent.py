@@ -174,10 +174,11 @@ class Agent(BaseAgent):
           LabelError, ValueError: as `act`; or the arguments are not equally many.
         """
         count = len(states)
-        told: Sequence[bool | None] = blocked or [None] * count
+        told: Sequence[bool | None] = [None] * count if blocked is None else blocked
         nowhere: list[MeasuredPose | None] = [None] * count
-        where: Sequence[MeasuredPose | None] = poses or nowhere
-        if {*map(len, (frames, targets, told, where, keys or states))} != {count}:
+        where: Sequence[MeasuredPose | None] = nowhere if poses is None else poses
+        given = states if keys is None else keys
+        if {*map(len, (frames, targets, told, where, given))} != {count}:
             raise ValueError(
                 f"{count} states: give as many frames, targets, keys, blocked and poses"
             )
@@ -340,6 +341,7 @@ def load(
     word_vectors: Path | str | None = None,
     synonyms: Synonyms | Path | str | None = None,
     decisions: Decisions = OWN_DECISIONS,
+    more_words: Mapping[str, Sequence[float]] | Path | str | None = None,
 ) -> Agent:
     """The agent of a run's newest checkpoint, or of a point of its history. Needs no rooms.
 
@@ -352,6 +354,7 @@ def load(
         they must be as wide.
       synonyms: other names of things, {"Mug": ["beaker"]}, or a JSON file of them.
       decisions: how the agent decides, in place of the run's settings.
+      more_words: further words, as for `add_words`; synonyms may be of these, too.
 
     Raises:
       ValueError: the folder holds no run, its checkpoint cannot be read, its word vectors are
@@ -362,6 +365,9 @@ def load(
     config = with_decisions(config, decisions, run)
     path = find_word_vectors(config, folder_of(run), word_vectors)
     vectors = words.load_word_vectors(path, classes.names)
+    if more_words is not None:
+        source = "words" if isinstance(more_words, Mapping) else more_words
+        vectors = vectors.extended(words.read_words(more_words), source)
     agent = Agent(config, weights, vectors, classes, grid, synonyms)
     shape = max(len(classes.names), 1), vectors.vectors.shape[1]
     expected, width = agent.model.parameter_shapes(*shape), None if path is None else shape[1]

@@ -70,11 +70,17 @@ class Camera:
     ) -> Camera:
         """The camera of a `sensor_msgs/CameraInfo`, of ROS 1 or 2; nothing is imported.
 
+        It is that of rectified images (`p`), or else of raw ones (`k`), if the message has no `p`.
+
         Raises:
           ValueError: the message holds no calibration.
         """
-        matrix = info.k if hasattr(info, "k") else info.K
-        focal, size = (matrix[0], matrix[4]), (info.width, info.height)
+        old = hasattr(info, "K")  # ROS 1
+        raw = info.K if old else info.k
+        rectified: Sequence[float] = getattr(info, "P" if old else "p", ())
+        focal, size = (raw[0], raw[4]), (info.width, info.height)
+        if len(rectified) == 12 and rectified[0] > 0 and rectified[5] > 0:
+            focal = rectified[0], rectified[5]
         if not all(value > 0 for value in (*focal, *size)):
             raise ValueError("CameraInfo: not calibrated, k or the size of the image is zero")
         hfov, vfov = (

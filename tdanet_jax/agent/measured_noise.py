@@ -138,7 +138,8 @@ def read_coco(
     Args:
       truth: file with `images`, `annotations` and `categories`. Crowds (`iscrowd`) are left out.
       found: file with a list of `image_id`, `category_id`, `bbox` and `score`, as ultralytics'
-        `val(save_json=True)` and torchvision's references write it.
+        `val(save_json=True)` and torchvision's references write it. An image is named by its id, or
+        as ultralytics does, by its file.
       least_score: detections below it are left out.
 
     Raises:
@@ -155,23 +156,41 @@ def read_coco(
         for i, one in enumerate(lists["categories"])
     }
     sizes: dict[Any, list[float]] = {}
+    by_file: dict[int | str, Any] = {}  # image ids as ultralytics writes them
     there: dict[Any, list[Detection]] = {}
     for i, one in enumerate(lists["images"]):
         at = f"images, {i}"
         number = _key(truth, at, one, "id")
         sizes[number] = [jsons.number(truth, one.get(n), f"{at}, {n}", 1e5) for n in _SIZE]
         there[number] = []
+        if isinstance(one.get("file_name"), str):
+            by_file[_number_of(Path(one["file_name"]).stem)] = number
         if min(sizes[number]) <= 0:
             raise FileError(truth, f"{at}: width and height must be positive")
     seen: dict[Any, list[Detection]] = {number: [] for number in there}
     for i, one in enumerate(lists["annotations"]):
         if not one.get("iscrowd"):
             _add(truth, f"annotations, {i}", one, names, sizes, there)
-    for i, one in enumerate(_entries(found, jsons.load(found))):
+    listed = _entries(found, jsons.load(found))
+    ids = {_key(found, str(i), one, "image_id") for i, one in enumerate(listed)}
+    if ids <= {*by_file} and any(by_file[name] != name for name in ids):
+        if ids <= {*sizes}:
+            raise FileError(
+                found,
+                f"image {min(ids, key=str)}: ids of images and names of files do not agree; give "
+                "images the numbers of their files as ids",
+            )
+        listed = [{**one, "image_id": by_file[one["image_id"]]} for one in listed]
+    for i, one in enumerate(listed):
         score = jsons.number(found, one.get("score"), f"{i}, score", 1)
         if score >= least_score:
             _add(found, str(i), one, names, sizes, seen, max(score, 0.0))
     return [*there.values()], [*seen.values()]
+
+
+def _number_of(stem: str) -> int | str:
+    """What ultralytics calls an image: its file's name, as a number if it is one."""
+    return int(stem) if stem.isdecimal() else stem
 
 
 def _entries(path: Path, listed: Any, at: str = "") -> list[dict[str, Any]]:

@@ -31,7 +31,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
         command = parse(Command, arguments, prog="tdanet export", description=__doc__)
-        files.check_empty(command.out)
+        files.check_new_folder(command.out)
         from tdanet_jax.training import devices
         from tdanet_jax.workflows import export
 

@@ -26,6 +26,7 @@ from tdanet_jax.agent.camera import Camera
 from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
 from tdanet_jax.commands.console import RunPath, one_line_errors, parse
 from tdanet_jax.decisions import OWN_DECISIONS, Decisions
+from tdanet_jax.poses import ITHOR, TURNS, PoseGrid
 
 #: Bytes of a line.
 LONGEST = 1 << 20
@@ -47,6 +48,12 @@ class Command:
     """Width of the image over its height."""
     horizon: float = 0.0
     """Degrees that the camera looks down where the robot does not tilt it."""
+    grid_size: float = ITHOR.grid_size
+    """Metres of a step of the robot straight ahead."""
+    turn: float = ITHOR.turn
+    """Degrees of a turn of the robot."""
+    horizons: tuple[int, ...] = ITHOR.horizons
+    """Degrees down to which the robot can tilt its camera; 0 alone if it cannot."""
     word_vectors: Path | None = None
     """File of word vectors in place of the run's copy."""
     words: Path | None = None
@@ -64,13 +71,20 @@ class Command:
             raise ValueError("--vfov and --aspect need --hfov")
         return Camera(90, 90, horizon=self.horizon)
 
+    @property
+    def grid(self) -> PoseGrid:
+        """The robot's turns and steps. Raises ValueError if a value is not possible."""
+        if self.turn not in TURNS:
+            raise ValueError(f"--turn {self.turn:g}: choose one of {', '.join(map(str, TURNS))}")
+        return PoseGrid(self.grid_size, round(360 / self.turn), self.horizons)
+
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
         command = parse(Command, arguments, prog="tdanet serve", description=__doc__)
         command.navigator.check()
-        camera = command.camera
+        camera, grid = command.camera, command.grid
         from tdanet_jax.agent import load
         from tdanet_jax.training import devices
 
@@ -81,9 +95,9 @@ def main(arguments: list[str] | None = None) -> None:
             word_vectors=command.word_vectors,
             synonyms=command.synonyms,
             decisions=command.decisions,
+            grid=grid,
+            more_words=command.words,
         )
-        if command.words is not None:
-            agent.add_words(command.words)
         serve(Navigator(agent, camera, command.navigator), sys.stdin.buffer)
 
 

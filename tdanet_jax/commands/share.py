@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
         command = parse(Command, arguments, prog="tdanet share", description=__doc__)
-        files.check_empty(command.out)
+        files.check_new_folder(command.out)
         from tdanet_jax.evaluation import saved_networks
         from tdanet_jax.training import devices
 

@@ -184,7 +184,7 @@ def nearest_distances(
     """Distance of the nearest instances of two classes in each scene, centre to centre.
 
     Returns:
-      [len(scenes)] metres; infinite where a scene does not hold both.
+      [len(scenes)] metres; infinite where a scene does not hold both, in known places.
     """
     gaps = np.full(len(scenes), np.inf)
     if first not in tables.classes or second not in tables.classes:
@@ -196,5 +196,6 @@ def nearest_distances(
         here = tables.object_scene == scene
         a, b = centres[here & is_first], centres[here & is_second]
         if len(a) and len(b):
-            gaps[i] = np.sqrt(((a[:, None] - b[None]) ** 2).sum(-1)).min()
+            apart = np.sqrt(((a[:, None] - b[None]) ** 2).sum(-1))
+            gaps[i] = np.nanmin(apart, initial=np.inf)  # the place of some is unknown
     return gaps

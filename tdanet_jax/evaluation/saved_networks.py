@@ -135,7 +135,7 @@ def share(run: Path | str, out: Path | str, word_vectors: Path | str | None = No
 
     Args:
       run: the run's folder.
-      out: folder to write.
+      out: folder to write, new or empty; it appears complete or not at all.
       word_vectors: where the run's word vectors are, if it holds no copy and the file was moved.
 
     Raises:
@@ -147,17 +147,16 @@ def share(run: Path | str, out: Path | str, word_vectors: Path | str | None = No
     snapshot = network.load()
     path = configs.find_word_vectors(network.config, run, word_vectors)
     vectors = None if path is None else words.load_word_vectors(path, vocabulary.names)
-    out.mkdir(parents=True, exist_ok=True)
-    history.save(out / history.NETWORK, snapshot, half=True)
-    configs.save(network.config, out / CONFIG_FILE)
-    vocabulary.save(out)
-    if vectors is not None:
-        vectors.save_copy(out / WORD_VECTORS_FILE, vocabulary.names)
-    for name in (report.RESULTS_PAGE, report.EPISODES_FILE, report.RESULTS_FILE):
-        if os.path.lexists(run / name):
-            content = regular.read_bytes(run / name, links=False)
-            with files.replacing(out / name) as fresh:
-                fresh.write_bytes(content)
+    with files.new_folder(out) as fresh:
+        history.save(fresh / history.NETWORK, snapshot, half=True)
+        configs.save(network.config, fresh / CONFIG_FILE)
+        vocabulary.save(fresh)
+        if vectors is not None:
+            vectors.save_copy(fresh / WORD_VECTORS_FILE, vocabulary.names)
+        for name in (report.RESULTS_PAGE, report.EPISODES_FILE, report.RESULTS_FILE):
+            if os.path.lexists(run / name):
+                content = regular.read_bytes(run / name, links=False)
+                (fresh / name).write_bytes(content)
 
 
 def evaluate(

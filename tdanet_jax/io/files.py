@@ -111,6 +111,31 @@ def check_empty(folder: Path, instead: str = "") -> None:
     check_writable(folder)
 
 
+def check_new_folder(folder: Path) -> None:
+    """As `check_empty`, for a folder that `new_folder` puts in place as a whole."""
+    if folder.resolve() == Path.cwd():
+        raise ValueError(f"--out {folder}: is the working folder; name a folder in it")
+    check_empty(folder)
+
+
+@contextlib.contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """A folder to write into that becomes `folder`, new or empty, at the end; removed on an error.
+
+    Raises:
+      ValueError: it is neither, or the working folder.
+      OSError: it cannot be written; the error names it.
+    """
+    check_new_folder(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    if folder.is_dir():
+        for left in folder.iterdir():  # by a killed process
+            shutil.rmtree(left) if left.is_dir() else left.unlink()
+    with replacing(folder) as fresh:
+        fresh.mkdir()
+        yield fresh
+
+
 def check_writable(out: Path) -> None:
     """Raises ValueError unless a file or folder can be written at `out`; leaves nothing there.
 

@@ -35,8 +35,9 @@ def co_occurrence(tables: SceneTables) -> np.ndarray:
     count = len(tables.classes)
     both, near = np.zeros((count, count), np.int32), np.zeros((count, count), np.int32)
     centres = (tables.object_box[:, :3] + tables.object_box[:, 3:]) / 2
+    known = np.isfinite(centres).all(axis=1)
     for scene in range(len(tables.scenes)):
-        here = np.flatnonzero(tables.object_scene == scene)
+        here = np.flatnonzero((tables.object_scene == scene) & known)
         here = here[np.argsort(tables.object_class[here], kind="stable")]
         kinds, first = np.unique(tables.object_class[here], return_index=True)
         if not kinds.size:

@@ -6,6 +6,7 @@ The controller is an argument: this module itself needs neither Unity nor the `a
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -30,15 +31,20 @@ def collect(
       rooms: (AI2-THOR scene name, room type) pairs.
       grid_size: metres between neighbouring reachable positions.
 
+    A room in which an action fails is left out with a warning.
+
     Raises:
-      SceneError: AI2-THOR reports that an action failed.
+      SceneError: no room is left.
     """
-    documents = []
+    documents: list[dict[str, Any]] = []
+    reason = "no rooms"
     for name, room_type in rooms:
         start = controller.reset(scene=name, gridSize=grid_size).metadata
         event = controller.step(action="GetReachablePositions")
         if not event.metadata["lastActionSuccess"]:
-            raise SceneError(f"{name}: GetReachablePositions: {event.metadata['errorMessage']}")
+            reason = f"{name}: GetReachablePositions: {event.metadata['errorMessage']}"
+            warnings.warn(f"{reason}; left out", stacklevel=2)
+            continue
         documents.append(
             {
                 "name": name,
@@ -53,6 +59,8 @@ def collect(
                 ],
             }
         )
+    if not documents:
+        raise SceneError(reason)
     return documents
 
 

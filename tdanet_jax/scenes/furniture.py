@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tdanet_jax.poses import GRID_SIZE
+from tdanet_jax.poses import GRID_SIZE, ITHOR
 from tdanet_jax.scenes import reachable
 from tdanet_jax.scenes.placement import LEVEL, SAME, chain, holds, shifted, supports
 from tdanet_jax.scenes.reachable import RADIUS
@@ -51,7 +51,8 @@ def shift(scene: Scene, draw: np.random.Generator, share: float) -> Scene:
     Args:
       share: of the furniture, the part that is tried.
     """
-    if (scene.grid.grid_size, isinstance(scene.room_type, str)) != (GRID_SIZE, True):
+    like_ithor = (scene.grid.grid_size, scene.grid.rotations) == (ITHOR.grid_size, ITHOR.rotations)
+    if not like_ithor or not isinstance(scene.room_type, str):
         return scene  # the rule of reachable points is for this grid; houses have rooms
     floor = float(np.median(scene.points[:, 1])) - STANDING
     names = [
@@ -184,6 +185,7 @@ def _reachable(
     its whole circle is on known floor.
     """
     level, size = float(np.median(points[:, 1])), GRID_SIZE
+    phase = np.round(points[0, LEVEL] % size, 6) % size  # of the grid; 0 in iTHOR
     kept = points[reachable.clear(points[:, LEVEL], level, moved)]
     boxes = np.array([item.box[:, LEVEL] for item in unit])
     low, high = boxes[:, 0].min(axis=0) - RADIUS, boxes[:, 1].max(axis=0) + RADIUS
@@ -192,7 +194,9 @@ def _reachable(
         for item in objects
         if (item.box[0, LEVEL] < high + RADIUS).all() and (item.box[1, LEVEL] > low - RADIUS).all()
     ]
+    low, high = low - phase, high - phase
     axes = [np.arange(np.ceil(low[a] / size), np.floor(high[a] / size) + 1) * size for a in (0, 1)]
+    axes = [axis + start for axis, start in zip(axes, phase, strict=True)]
     spots = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     spots = spots[_is_floor(spots, area, points) & ~reachable.clear(spots, level, unit)]
     spots = spots[reachable.clear(spots, level, near)]

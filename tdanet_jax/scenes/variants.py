@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import json
@@ -60,7 +61,8 @@ def make(
 ) -> Rooms:
     """Variants 1 to `copies` of some rooms, room by room, with a note on how they were made.
 
-    Those in which no target can be found are left out.
+    Those in which no target can be found are left out. Targets, parents and class graph are those
+    that the rooms came with.
 
     Args:
       names: the rooms.
@@ -83,10 +85,9 @@ def make(
 
     classes, targets = rooms.tables.classes, rooms.tables.targets
     tables = tabulation.build(varied, classes, targets, progress=report)
-    if empty := survey.without_targets(tables):
-        varied = [scene for scene in varied if scene.name not in empty]
-        tables = tables.subset([scene.name for scene in varied])
-    extras = Extras(
+    extras = dataclasses.replace(
+        rooms.extras or Extras(),
+        episodes=(),
         parts={scene.name: scene.part for scene in varied if scene.part is not None},
         made={
             "command": "vary",
@@ -97,6 +98,11 @@ def make(
             "version": tdanet_jax.__version__,
         },
     )
+    if empty := survey.without_targets(Rooms(tables, extras)):
+        varied = [scene for scene in varied if scene.name not in empty]
+        tables = tables.subset([scene.name for scene in varied])
+        left = {name: part for name, part in extras.parts.items() if name not in empty}
+        extras = dataclasses.replace(extras, parts=left)
     return Rooms(tables, extras, records=of_scenes(varied))
 
 

@@ -56,13 +56,11 @@ def export(run: Path | str, folder: Path | str, word_vectors: Path | str | None 
         folder is not empty.
     """
     run, folder = find_run(run), Path(folder)
-    files.check_empty(folder)
+    files.check_new_folder(folder)
     agent = agents.load(run, word_vectors=word_vectors)
     check(agent)
     path = find_word_vectors(agent.config, folder_of(run), word_vectors)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with files.replacing(folder) as fresh:
-        fresh.mkdir()
+    with files.new_folder(folder) as fresh:
         _write_agent(agent, path, fresh)
         _copy_package(fresh / PACKAGE)
     return folder

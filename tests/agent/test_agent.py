@@ -521,6 +521,17 @@ def test_robots_together_are_told_equally_much(odometry_agent):
         odometry_agent.act_many(states, [[], []], ["mug", "mug"], poses=[None, pose])
 
 
+def test_what_robots_together_are_told_may_be_an_array(odometry_agent):
+    """Of one robot, too: array([False]) is not nothing."""
+    for count in (1, 2):
+        states, frames, targets = [odometry_agent.start()] * count, [[]] * count, ["mug"] * count
+        keys, told = jax.random.split(jax.random.key(0), count), [True, False][-count:]
+        states = [s for s, _ in odometry_agent.act_many(states, frames, targets, blocked=told)]
+        as_lists = odometry_agent.act_many(states, frames, targets, [*keys], told)
+        as_arrays = odometry_agent.act_many(states, frames, targets, keys, np.array(told))
+        assert [d.action for _, d in as_lists] == [d.action for _, d in as_arrays]
+
+
 def test_measured_poses_are_believed(triangulating_agent):
     """Where motion goes as planned they change nothing; else the map and estimate follow them."""
     mug, sink = Detection("mug", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.6, 0.1, 0.8, 0.4)
@@ -667,3 +678,12 @@ def test_a_point_of_the_history_is_loaded_by_its_file(weights, glove, tmp_path):
     loaded = tdanet_jax.load(path)
     for ours, theirs in zip(jax.tree.leaves(loaded.weights), jax.tree.leaves(weights), strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+def test_synonyms_may_be_of_further_words():
+    """In one call, as `tdanet serve --words --synonyms` has them."""
+    words, names = {"zwieback": [0.1] * 50}, {"zwieback": ["rusk"]}
+    loaded = tdanet_jax.load(OLD_RUN, synonyms=names, more_words=words)
+    assert loaded.labels.resolve("rusk") == "zwieback"
+    with pytest.raises(ValueError, match="zwieback"):
+        tdanet_jax.load(OLD_RUN, synonyms=names)

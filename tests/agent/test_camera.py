@@ -146,6 +146,11 @@ def test_the_camera_of_a_message_of_ros(name):
     camera = Camera.from_camera_info(info, horizon=20)
     assert (camera.hfov, camera.horizon) == (pytest.approx(90), 20)
     assert camera.vfov == pytest.approx(Camera(90, aspect=4 / 3).vfov)
+    rectified = [160.0, 0, 319, 0, 0, 160.0, 239, 0, 0, 0, 1, 0]  # k is of the raw image
+    info = SimpleNamespace(**vars(info), **{"p" if name == "k" else "P": rectified})
+    assert Camera.from_camera_info(info).hfov == pytest.approx(2 * math.degrees(math.atan(2)))
+    info = SimpleNamespace(**vars(info) | {"p" if name == "k" else "P": [0.0] * 12})
+    assert Camera.from_camera_info(info).hfov == pytest.approx(90)
     empty = SimpleNamespace(width=0, height=0, k=[0.0] * 9)
     with pytest.raises(ValueError, match="CameraInfo: not calibrated"):
         Camera.from_camera_info(empty)

@@ -183,6 +183,30 @@ def test_files_in_cocos_formats_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "files", [("a.jpg", "b.jpg"), ("000012.jpg", "13.png"), ("8.jpg", "9.jpg")]
+)
+def test_images_may_be_named_by_their_files(tmp_path: Path, files: tuple[str, str]) -> None:
+    """As ultralytics names them: "a", or 12 if the name is a number."""
+    pairs = zip(TRUTH["images"], files, strict=True)
+    images = [{**image, "file_name": f"shots/{name}"} for image, name in pairs]
+    stems = [Path(name).stem for name in files]
+    called = [int(stem) if stem.isdecimal() else stem for stem in stems]
+    named = dict(zip((7, 8), called, strict=True))
+    renamed = [{**one, "image_id": named[one["image_id"]]} for one in FOUND]
+    expected = measured_noise.read_coco(*written(tmp_path, TRUTH, FOUND))
+    truth = {**TRUTH, "images": images}
+    assert measured_noise.read_coco(*written(tmp_path, truth, renamed)) == expected
+    assert measured_noise.read_coco(*written(tmp_path, truth, FOUND)) == expected
+
+
+def test_images_that_ids_and_files_name_differently_are_refused(tmp_path: Path) -> None:
+    files = {7: "8.jpg", 8: "7.jpg"}
+    images = [{**image, "file_name": files[image["id"]]} for image in TRUTH["images"]]
+    with pytest.raises(FileError, match="ids of images and names of files do not agree"):
+        measured_noise.read_coco(*written(tmp_path, {**TRUTH, "images": images}, FOUND))
+
+
+@pytest.mark.parametrize(
     ("truth", "found", "message"),
     [
         ({**TRUTH, "images": 3}, FOUND, r"truth.json: images: not a list of objects"),

@@ -113,3 +113,23 @@ def test_an_episode(node):
     node.tell("action_done")
     node.tell("detections", **frame(10))
     assert node.published == ["MoveAhead", "Done"]
+
+
+def test_a_new_target_waits_for_the_action_under_way(node):
+    """Else the next frame, taken in motion, would lead to a second action."""
+    node.tell("camera_info", width=640, height=480, k=[320.0, 0, 320, 0, 320.0, 240, 0, 0, 1])
+    stand(node, 0.0, 0.0, 0.0)
+    node.tell("target", data="mug")
+    node.tell("detections", **frame(1))
+    assert node.published == ["MoveAhead"]
+    node.time = 2
+    node.tell("target", data="tv")
+    node.tell("detections", **frame(3))  # it still moves
+    assert node.published == ["MoveAhead"]
+    node.time = 4
+    node.tell("action_done")
+    node.tell("detections", **frame(5))
+    assert node.published == ["MoveAhead", "Done"]
+    assert node.log[-1] == "tv: done"
+    node.tell("target", data="mug")  # no driver need answer Done
+    assert node.since == 4

@@ -119,6 +119,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
     "share": [
         ("", "Missing from tdanet share: --checkpoint RUN"),
         ("--checkpoint bare --out full", "--out full: exists and is not empty"),
+        ("--checkpoint bare --out .", "--out .: is the working folder; name a folder in it"),
         ("--checkpoint bare --out new", "bare: no checkpoint"),
         ("--checkpoint bare --out full/file/below", "--out full/file/below: Not a directory"),
         ("--checkpoint nowhere --out new", "nowhere/config.json: no such file"),
@@ -126,6 +127,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
     "export": [
         ("", "Missing from tdanet export: --checkpoint RUN"),
         ("--checkpoint bare --out full", "--out full: exists and is not empty"),
+        ("--checkpoint bare --out .", "--out .: is the working folder; name a folder in it"),
         ("--checkpoint bare --out new", "bare/checkpoints: no checkpoint"),
         ("--checkpoint bare --out full/file/below", "--out full/file/below: Not a directory"),
         ("--checkpoint nowhere --out new", "nowhere/config.json: no such file"),
@@ -148,6 +150,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("", "Missing from tdanet serve: --checkpoint RUN"),
         ("--checkpoint nowhere", "nowhere/config.json: no such file"),
         ("--checkpoint bare", "bare/checkpoints: no checkpoint"),
+        ("--checkpoint bare --turn 50", "--turn 50: choose one of 15, 30, 45, 60, 90"),
         ("--checkpoint bare --hfov 200 --vfov 50", "camera: hfov 200.0: must be between 5 and 180"),
         ("--checkpoint bare --hfov 60", "camera: give either vfov, in degrees, or aspect"),
         ("--checkpoint bare --vfov 60", "--vfov and --aspect need --hfov"),

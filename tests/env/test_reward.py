@@ -322,3 +322,23 @@ def test_the_configuration_says_what_is_paid_for(
         np.testing.assert_allclose(np.asarray(params.similarity)[visible], 1.0, rtol=1e-6)
         hidden = [some_rooms.targets.index(name) for name in task.split.hidden]
         assert not np.asarray(params.similarity)[:, hidden].any()
+
+
+def test_an_object_in_an_unknown_place_is_as_if_it_were_not_there(some_rooms: SceneTables) -> None:
+    """Imported rooms may have such objects beside others of their class."""
+    scene, kind = 0, some_rooms.classes.index("Cabinet")
+    here = np.flatnonzero((some_rooms.object_scene == scene) & (some_rooms.object_class == kind))
+    assert len(here) > 1
+    centres = some_rooms.object_box.reshape(-1, 2, 3).mean(axis=1)
+    [mug] = np.flatnonzero(
+        (some_rooms.object_scene == scene)
+        & (some_rooms.object_class == some_rooms.classes.index("Mug"))
+    )
+    gaps = np.linalg.norm(centres[here] - centres[mug], axis=1)
+    box = some_rooms.object_box.copy()
+    box[here[gaps.argmin()]] = np.nan
+    tables = dataclasses.replace(some_rooms, object_box=box)
+    found = reward.nearest_distances(tables, "Mug", "Cabinet", np.array([scene]))
+    assert found == pytest.approx(np.sort(gaps)[1])
+    box[here] = np.nan
+    assert np.isinf(reward.nearest_distances(tables, "Mug", "Cabinet", np.array([scene]))).all()

@@ -73,7 +73,9 @@ def test_a_parameter_that_does_not_fit_is_one_clear_error(
 def test_the_agent_of_the_project_plays_in_the_rooms_of_the_project(ithor: SceneTables) -> None:
     for name in bundled_agents.names():
         run = BUNDLED.parent / name
-        assert newest(run).data_version == ithor.data_version
+        sought = configs.load(run / CONFIG_FILE).sought
+        tables = dataset.find_targets(sought, dataset.Rooms(ithor, None))[0]
+        assert newest(run).data_version == tables.data_version
         assert decision(run).sum() == pytest.approx(1.0)
 
 
@@ -175,7 +177,7 @@ def run_of_files(
     )
     vectors = words.load_word_vectors(config.word_vectors)
     task, _ = save_untrained(config, home / "run", some_rooms, vectors)
-    where = {"folder": home / "run", "mesh": devices.first()}
+    where = {"folder": home / "run", "mesh": devices.first(), "progress": 1.0}
     training._prepare(SimpleNamespace(**where, config=config, task=task), Callbacks())
     return home / "run"
 
@@ -245,3 +247,19 @@ def test_word_vectors_of_another_width_are_refused(run_of_files: Path, tmp_path:
     np.savez(tmp_path / "wide.npz", words=["mug"], vectors=np.ones((1, 300)))
     with pytest.raises(ValueError, match="trained with word vectors of another width than 300"):
         tdanet_jax.load(run_of_files, word_vectors=tmp_path / "wide.npz")
+
+
+def test_a_shared_folder_is_there_as_a_whole_or_not_at_all(
+    opinionated_run: Path, tmp_path: Path
+) -> None:
+    """A folder that holds a part would be refused the next time."""
+    run, out = tmp_path / "run", tmp_path / "out"
+    shutil.copytree(opinionated_run, run)
+    (run / report.EPISODES_FILE).unlink()
+    (run / report.EPISODES_FILE).symlink_to(opinionated_run / report.EPISODES_FILE)
+    with pytest.raises(ValueError, match=r"episodes\.jsonl"):
+        saved_networks.share(run, out)
+    assert not out.exists()
+    (run / report.EPISODES_FILE).unlink()
+    saved_networks.share(run, out)
+    assert newest(out).updates == newest(run).updates

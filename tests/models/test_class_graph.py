@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -90,3 +93,18 @@ def test_no_unseen_class_is_a_node(ithor: SceneTables, glove: WordVectors, split
     classes = make_task(TrainConfig(split=split), ithor, glove).classes
     assert classes.normalised_adjacency().shape == (len(classes.known),) * 2
     assert len(ithor.classes) - len(classes.known) == int(split.partition("/")[2])
+
+
+def test_an_object_in_an_unknown_place_joins_and_parts_nothing(some_rooms: SceneTables) -> None:
+    """Imported rooms may have such objects beside others of their class."""
+    kept = np.ones(len(some_rooms.object_class), bool)
+    kept[::5] = False
+    unknown = np.where(kept[:, None], some_rooms.object_box, np.nan).astype(np.float32)
+    arrays = {
+        name: getattr(some_rooms, name)[kept]
+        for name in ("object_box", "object_class", "object_scene")
+    }
+    found = class_graph.co_occurrence(dataclasses.replace(some_rooms, object_box=unknown))
+    without = class_graph.co_occurrence(SimpleNamespace(**vars(some_rooms) | arrays))
+    np.testing.assert_array_equal(found, without)
+    assert (found != class_graph.co_occurrence(some_rooms)).any()

@@ -67,6 +67,22 @@ def test_another_grid_size_is_asked_for_and_noted(tmp_path: Path) -> None:
     assert scene.grid == PoseGrid(0.125)
 
 
+def test_a_room_that_fails_costs_no_other() -> None:
+    controller, rooms = FakeController(), [("A", "kitchen"), ("B", "kitchen"), ("C", "kitchen")]
+    works = iter([True, False, True])
+    step = controller.step
+
+    def sometimes(action: str) -> SimpleNamespace:
+        controller.works = next(works)
+        return step(action)
+
+    controller.step = sometimes  # type: ignore[method-assign]
+    with pytest.warns(UserWarning, match="B: GetReachablePositions: broken; left out"):
+        documents = collect.collect(controller, rooms)
+    assert [document["name"] for document in documents] == ["A", "C"]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_failed_action() -> None:
     with pytest.raises(SceneError, match="FloorPlan1: GetReachablePositions: broken"):
         collect.collect(FakeController(works=False), [("FloorPlan1", "kitchen")])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tdanet_jax.poses import PoseGrid
-from tdanet_jax.scenes import furniture, ithor
+from tdanet_jax.scenes import furniture, ithor, placement
 from tdanet_jax.scenes.scene import Scene, SceneObject
 from tests.scenes.test_reachable import parts
 from tests.support import toy
@@ -116,10 +116,33 @@ def test_what_is_built_in_or_hangs_stays() -> None:
         assert new is old
 
 
-@pytest.mark.parametrize("change", [{"room_type": ("kitchen",) * 9}, {"grid": PoseGrid(0.5)}])
+@pytest.mark.parametrize(
+    "change",
+    [{"room_type": ("kitchen",) * 200}, {"grid": PoseGrid(0.5)}, {"grid": PoseGrid(rotations=4)}],
+)
 def test_houses_and_other_grids_are_left_as_they_are(change: dict[str, object]) -> None:
-    scene = dataclasses.replace(toy.room(toy.line(9), TABLE), **change)  # type: ignore[arg-type]
+    """A room with turns of 90 degrees has no diagonals: its parts are others than iTHOR's."""
+    room = toy.room(grid(range(13), range(13), TABLE), TABLE)
+    assert furniture.shift(room, np.random.default_rng(0), 1.0) is not room
+    scene = dataclasses.replace(room, **change)  # type: ignore[arg-type]
     assert furniture.shift(scene, np.random.default_rng(0), 1.0) is scene
+
+
+@pytest.mark.parametrize("offset", [(0.1, 0.05), (-0.2, 0.125), (1.0, -2.5)])
+def test_a_room_somewhere_else_changes_in_the_same_way(offset: tuple[float, float]) -> None:
+    """Points of rooms of one's own need not be multiples of 0.25 m from the world's origin."""
+    way = np.array([offset[0], 0.0, offset[1]])
+    room = toy.room(grid(range(13), range(13), TABLE), TABLE, DRAWER)
+    moved = dataclasses.replace(
+        room,
+        points=room.points + way,
+        objects=tuple(placement.shifted(item, way) for item in room.objects),
+    )
+    for seed in range(4):
+        here, there = (furniture.shift(r, np.random.default_rng(seed), 1.0) for r in (room, moved))
+        np.testing.assert_allclose(there.points, here.points + way, atol=1e-6)
+        for old, new in zip(here.objects, there.objects, strict=True):
+            np.testing.assert_allclose(new.box, old.box + way, atol=1e-6)
 
 
 @pytest.fixture(scope="module")

@@ -110,14 +110,34 @@ def test_a_file_is_made_of_training_rooms_again_bit_for_bit(rooms: Rooms, tmp_pa
 
 
 def test_rooms_in_which_no_target_can_be_found_are_named(rooms: Rooms) -> None:
-    assert survey.without_targets(rooms.tables) == []
+    assert survey.without_targets(rooms) == []
     bare = dataclasses.replace(
         rooms.tables,
         distance=np.where(
             (rooms.tables.position_scene == 1).repeat(16)[:, None], -1, rooms.tables.distance
         ).astype(np.int16),
     )
-    assert survey.without_targets(bare) == [NAMES[1]]
+    assert survey.without_targets(Rooms(bare, None)) == [NAMES[1]]
+
+
+def test_variants_have_the_types_and_targets_that_their_rooms_came_with(rooms: Rooms) -> None:
+    """Kettle is no target of the paper's, and an office no room type of iTHOR's."""
+    first, second = rooms.scenes(NAMES[:2])
+    office = dataclasses.replace(first, name="A1", room_type="office")
+    for scene, targets in ((office, {}), (second, {second.room_type: ("Kettle", "Cabinet")})):
+        extras = Extras(targets=targets, parts={scene.name: "train"})
+        given = Rooms(
+            tabulation.build([scene], rooms.tables.classes, rooms.tables.targets),
+            extras,
+            records=of_scenes([scene]),
+        )
+        made = variants.make(given, [scene.name], [scene.name], 1, seed=3)
+        assert made.tables.scenes == (f"{scene.name}-v01",)
+        assert made.tables.room_types[made.tables.room_type[0]] == scene.room_type
+        assert made.extras is not None
+        assert made.extras.targets == targets
+        nothing = dataclasses.replace(extras, targets={"bedroom": ("Pillow",)})
+        assert survey.without_targets(Rooms(made.tables, nothing)) == [f"{scene.name}-v01"]
 
 
 def perturbed(scenes: list[Scene], names: tuple[str, ...]) -> list[Scene]:

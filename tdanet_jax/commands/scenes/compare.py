@@ -40,5 +40,8 @@ class Compare:
         if not chosen:
             fail(f"{self.data}: has no training rooms to compare with")
         title = "bundled" if self.data is None else Path(self.data).stem[:11]
-        columns = {title: other.tables.subset(chosen), Path(self.rooms).stem[:11]: given.tables}
+        own = Path(self.rooms).stem[:11]
+        if own == title:
+            title, own = "compared", "given"
+        columns = {title: other.tables.subset(chosen), own: given.tables}
         console.print(*survey.making(given), *room_statistics.table(columns), sep="\n")

@@ -14,9 +14,10 @@ from scipy.sparse.csgraph import connected_components
 from tdanet_jax import words
 from tdanet_jax.scenes.dataset import Rooms, assign_rooms, find_targets
 from tdanet_jax.scenes.tables import SceneTables
+from tdanet_jax.scenes.target_distances import with_targets
 from tdanet_jax.scenes.visibility.rules import RULES
-from tdanet_jax.splits import Split, make_split
-from tdanet_jax.targets import PAPER
+from tdanet_jax.splits import Split, in_order, make_split
+from tdanet_jax.targets import PAPER, find
 from tdanet_jax.vocabulary import ROOM_TYPES
 
 
@@ -103,11 +104,19 @@ def making(rooms: Rooms) -> Iterator[str]:
         yield "Made by " + ", ".join(f"{name} {value}" for name, value in rooms.extras.made.items())
 
 
-def without_targets(tables: SceneTables) -> list[str]:
+def without_targets(rooms: Rooms) -> list[str]:
     """The rooms in which no target of their type can be found."""
-    split = assign_rooms(make_split("22/0"), Rooms(tables, None))
+    own = {} if rooms.extras is None else rooms.extras.targets
+    meant: dict[str, set[str | None]]
+    if own:
+        meant = {room: {find(name, rooms.tables.classes) for name in own[room]} for room in own}
+        every = in_order({name for names in meant.values() for name in names if name is not None})
+        tables = with_targets(rooms.tables, every)
+    else:
+        tables, usual = find_targets(PAPER, Rooms(rooms.tables, None))
+        meant = {room: {*names} for room, names in usual.items()}
     asked = np.array(
-        [[t in split.seen[room] for t in tables.targets] for room in tables.room_types]
+        [[t in meant.get(room, ()) for t in tables.targets] for room in tables.room_types]
     )
     found = (tables.reachable & asked[tables.position_room_type]).any(axis=1)
     full = np.bincount(tables.position_scene, found, len(tables.scenes)) > 0
