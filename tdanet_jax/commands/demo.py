@@ -80,12 +80,14 @@ def show(command: Command, choice: Choice) -> None:
         rooms = Rooms(tables, extras=None)
     else:  # its targets are found in its training rooms, and those of validation are others
         rooms = load_rooms(None)
+    rooms = one_episode.with_target(choice, rooms)
     player = trace.load_player(command.checkpoint, rooms)
-    traces = one_episode.play(choice, [command.checkpoint], [player], rooms.tables)
+    tables = player.task.tables
+    traces = one_episode.play(choice, [command.checkpoint], [player], tables)
     command.out.parent.mkdir(parents=True, exist_ok=True)
     if command.out.suffix == ".gif":
-        plan = floor_plan.of_room(rooms.tables, command.scene)
-        pictures.animation(traces, plan, rooms.tables, command.out)
+        plan = floor_plan.of_room(tables, command.scene)
+        pictures.animation(traces, plan, tables, command.out)
     else:
-        files.write_text(command.out, replay.page(traces, rooms.tables))
+        files.write_text(command.out, replay.page(traces, tables))
     one_episode.print_outcomes(traces, command.out)

@@ -96,13 +96,17 @@ def rooms_of(choice: Choice, runs: Sequence[Path]) -> Rooms:
 
     Shows progress if they are rebuilt.
     """
-    from tdanet_jax.labels import Labels
-    from tdanet_jax.scenes.target_distances import with_targets
-
     run = folder_of(runs[0])
     files = EvalConfig(data=choice.data, word_vectors=choice.word_vectors)
     data = files.locate(configs.load(run / CONFIG_FILE), run).data
-    rooms = load_rooms(data)
+    return with_target(choice, load_rooms(data))
+
+
+def with_target(choice: Choice, rooms: Rooms) -> Rooms:
+    """The rooms with --target among the targets if it is a class."""
+    from tdanet_jax.labels import Labels
+    from tdanet_jax.scenes.target_distances import with_targets
+
     classes = rooms.tables.classes
     sought = Labels(classes).find(choice.target) if choice.target else None
     asked = [sought] if sought in classes else []

@@ -288,6 +288,6 @@ def test_the_demo_shows_any_run(opinionated_run, tmp_path, changed):
     """Its rooms for training and validation, and its targets, need not be the paper's."""
     run, page = shutil.copytree(opinionated_run, tmp_path / "run"), tmp_path / "page.html"
     configs.save(dataclasses.replace(TINY, **changed), run / CONFIG_FILE)
-    demo.main(["--checkpoint", str(run), "--no-show", "--out", str(page), "--target", "Mug",
+    demo.main(["--checkpoint", str(run), "--no-show", "--out", str(page), "--target", "Book",
                "--scene", "FloorPlan305"])  # fmt: skip
     assert "FloorPlan305" in page.read_text()
