@@ -28,6 +28,7 @@ _OF_DETECTIONS = (
     "misses", "small_misses", "false_positives", "duplicates", "swaps", "confusions", "jitter",
     "truncation", "scores",
 )  # fmt: skip
+
 #: Side of a box, as a share of the image's, at which misses of small boxes have fallen to 1/e.
 SMALL_SIDE = 0.1
 
@@ -100,7 +101,7 @@ class SenseNoise:
                 )
 
     def check_image(self) -> None:
-        """Raises ValueError if detections err: for agents that look at an image, which does not."""
+        """Raises ValueError if a level of detections is above 0: an image stays as it is."""
         for name in _OF_DETECTIONS:
             if ends(getattr(self, name))[1] > 0:
                 raise ValueError(

@@ -358,7 +358,8 @@ def load(
 
     Raises:
       ValueError: the folder holds no run, its checkpoint cannot be read, its word vectors are
-        missing or of another width, or `decisions` do not fit the run.
+        missing or of another width, `decisions` do not fit the run, or `more_words` are not words
+        with vectors of the same width.
     """
     run = find_run(run)
     config, weights, classes = read(run)

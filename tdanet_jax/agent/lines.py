@@ -64,7 +64,7 @@ def _step(navigator: Navigator, frame: dict[str, Any], source: str) -> str:
         }
         navigator.reset(frame["target"], **where)
     elif given := [name for name in ("rotation", "horizon") if name in frame]:
-        raise FileError(source, f"{given[0]} is of an episode's first frame, with a target")
+        raise FileError(source, f"{given[0]}: only together with target, which begins an episode")
     elif navigator.target is None or navigator.finished:
         raise FileError(source, "no episode has begun, or it is over: give a target")
     return navigator.step(found, blocked, measured)

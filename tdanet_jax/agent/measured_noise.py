@@ -157,6 +157,7 @@ def read_coco(
     }
     sizes: dict[Any, list[float]] = {}
     by_file: dict[int | str, Any] = {}  # image ids as ultralytics writes them
+    twice: set[int | str] = set()
     there: dict[Any, list[Detection]] = {}
     for i, one in enumerate(lists["images"]):
         at = f"images, {i}"
@@ -164,7 +165,9 @@ def read_coco(
         sizes[number] = [jsons.number(truth, one.get(n), f"{at}, {n}", 1e5) for n in _SIZE]
         there[number] = []
         if isinstance(one.get("file_name"), str):
-            by_file[_number_of(Path(one["file_name"]).stem)] = number
+            name = _number_of(Path(one["file_name"]).stem)
+            twice |= {name} & {*by_file}
+            by_file[name] = number
         if min(sizes[number]) <= 0:
             raise FileError(truth, f"{at}: width and height must be positive")
     seen: dict[Any, list[Detection]] = {number: [] for number in there}
@@ -173,13 +176,15 @@ def read_coco(
             _add(truth, f"annotations, {i}", one, names, sizes, there)
     listed = _entries(found, jsons.load(found))
     ids = {_key(found, str(i), one, "image_id") for i, one in enumerate(listed)}
-    if ids <= {*by_file} and any(by_file[name] != name for name in ids):
+    if ids <= {*by_file} and (other := {name for name in ids if by_file[name] != name}):
         if ids <= {*sizes}:
             raise FileError(
                 found,
-                f"image {min(ids, key=str)}: ids of images and names of files do not agree; give "
-                "images the numbers of their files as ids",
+                f"image {min(other, key=str)}: is the id of one image and the file name of "
+                "another; number the images as their files",
             )
+        if shared := ids & twice:
+            raise FileError(found, f"image {min(shared, key=str)}: two images have this file name")
         listed = [{**one, "image_id": by_file[one["image_id"]]} for one in listed]
     for i, one in enumerate(listed):
         score = jsons.number(found, one.get("score"), f"{i}, score", 1)

@@ -18,7 +18,7 @@ from tdanet_jax.commands import one_episode
 from tdanet_jax.commands.console import RunPath, check_file, console, fail, one_line_errors, parse
 from tdanet_jax.commands.one_episode import Choice
 from tdanet_jax.config import CONFIG_FILE
-from tdanet_jax.io.bundled_agents import find_run
+from tdanet_jax.io.bundled_agents import find_run, folder_of
 from tdanet_jax.targets import PAPER
 
 #: A task has rooms to train in and rooms to be tested in; these two are computed in no time.
@@ -74,7 +74,7 @@ def show(command: Command, choice: Choice) -> None:
     console.print(f"{command.checkpoint.name} looks for {command.target} ...")
     names = dict.fromkeys((command.scene, *SMALL_ROOMS))
     classes = {item.object_class for scene in scenes.values() for item in scene.objects}
-    config = configs.load(command.checkpoint / CONFIG_FILE)
+    config = configs.load(folder_of(command.checkpoint) / CONFIG_FILE)
     if config.sought == PAPER and not config.validation:
         tables = tabulation.build([scenes[name] for name in names], sorted(classes))
         rooms = Rooms(tables, extras=None)

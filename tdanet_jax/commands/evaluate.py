@@ -92,7 +92,7 @@ def main(arguments: list[str] | None = None) -> None:
             seed=command.seed or 0,
         )
         test = dataclasses.replace(command.test, noise=None) if sweep else command.test
-        test.check()
+        test.check(command.policy, command.seed)
         if not trained:
             test.with_targets(dataclasses.replace(config, data=test.data)).check()
         kind = f"noise-{command.policy}" if sweep else command.policy

@@ -26,7 +26,7 @@ from tdanet_jax.agent.camera import Camera
 from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
 from tdanet_jax.commands.console import RunPath, one_line_errors, parse
 from tdanet_jax.decisions import OWN_DECISIONS, Decisions
-from tdanet_jax.poses import ITHOR, TURNS, PoseGrid
+from tdanet_jax.poses import ITHOR, SIZES, TURNS, PoseGrid
 
 #: Bytes of a line.
 LONGEST = 1 << 20
@@ -49,11 +49,12 @@ class Command:
     horizon: float = 0.0
     """Degrees that the camera looks down where the robot does not tilt it."""
     grid_size: float = ITHOR.grid_size
-    """Metres of a step of the robot straight ahead."""
+    """Metres of a step of the robot straight ahead, from 0.05 to 0.5."""
     turn: float = ITHOR.turn
     """Degrees of a turn of the robot."""
     horizons: tuple[int, ...] = ITHOR.horizons
-    """Degrees down to which the robot can tilt its camera; 0 alone if it cannot."""
+    """Degrees down to which the robot can tilt its camera, ascending, with 0. If it cannot, leave
+    this and use --forbid LookUp LookDown."""
     word_vectors: Path | None = None
     """File of word vectors in place of the run's copy."""
     words: Path | None = None
@@ -74,6 +75,11 @@ class Command:
     @property
     def grid(self) -> PoseGrid:
         """The robot's turns and steps. Raises ValueError if a value is not possible."""
+        if not SIZES[0] <= self.grid_size <= SIZES[1]:
+            least, most = SIZES
+            raise ValueError(
+                f"--grid-size {self.grid_size:g}: must be from {least} to {most} metres"
+            )
         if self.turn not in TURNS:
             raise ValueError(f"--turn {self.turn:g}: choose one of {', '.join(map(str, TURNS))}")
         return PoseGrid(self.grid_size, round(360 / self.turn), self.horizons)

@@ -360,7 +360,7 @@ def write_report(
 
 
 def check_alike(runs: Sequence[FinishedRun], planned: Sequence[Path] = ()) -> None:
-    """Fails if the runs, and those planned, do not fit into one table."""
+    """Fails if the runs, and those planned, do not fit into one report."""
     folders = [run.folder for run in runs]
     names = [folder.name for folder in (*folders, *(set(planned) - set(folders)))]
     for name in names:

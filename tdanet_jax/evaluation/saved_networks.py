@@ -147,16 +147,19 @@ def share(run: Path | str, out: Path | str, word_vectors: Path | str | None = No
     snapshot = network.load()
     path = configs.find_word_vectors(network.config, run, word_vectors)
     vectors = None if path is None else words.load_word_vectors(path, vocabulary.names)
+    kept = {
+        name: regular.read_bytes(run / name, links=False)
+        for name in (report.RESULTS_PAGE, report.EPISODES_FILE, report.RESULTS_FILE)
+        if os.path.lexists(run / name)
+    }
     with files.new_folder(out) as fresh:
         history.save(fresh / history.NETWORK, snapshot, half=True)
         configs.save(network.config, fresh / CONFIG_FILE)
         vocabulary.save(fresh)
         if vectors is not None:
             vectors.save_copy(fresh / WORD_VECTORS_FILE, vocabulary.names)
-        for name in (report.RESULTS_PAGE, report.EPISODES_FILE, report.RESULTS_FILE):
-            if os.path.lexists(run / name):
-                content = regular.read_bytes(run / name, links=False)
-                (fresh / name).write_bytes(content)
+        for name, content in kept.items():
+            (fresh / name).write_bytes(content)
 
 
 def evaluate(

@@ -129,8 +129,8 @@ def new_folder(folder: Path) -> Iterator[Path]:
     check_new_folder(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     if folder.is_dir():
-        for left in folder.iterdir():  # by a killed process
-            shutil.rmtree(left) if left.is_dir() else left.unlink()
+        for left in [*folder.iterdir()]:  # by a killed process
+            _remove(left)
     with replacing(folder) as fresh:
         fresh.mkdir()
         yield fresh

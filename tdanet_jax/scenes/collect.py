@@ -26,12 +26,12 @@ def collect(
 ) -> list[dict[str, Any]]:
     """The documents of a scene file, one per scene of AI2-THOR.
 
+    A room in which an action fails is left out with a warning.
+
     Args:
       controller: an `ai2thor.controller.Controller`, or an object with its `reset` and `step`.
       rooms: (AI2-THOR scene name, room type) pairs.
       grid_size: metres between neighbouring reachable positions.
-
-    A room in which an action fails is left out with a warning.
 
     Raises:
       SceneError: no room is left.

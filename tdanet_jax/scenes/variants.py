@@ -85,8 +85,10 @@ def make(
 
     classes, targets = rooms.tables.classes, rooms.tables.targets
     tables = tabulation.build(varied, classes, targets, progress=report)
+    own = rooms.extras or Extras()
     extras = dataclasses.replace(
-        rooms.extras or Extras(),
+        own,
+        targets={room: own.targets[room] for room in own.targets if room in tables.room_types},
         episodes=(),
         parts={scene.name: scene.part for scene in varied if scene.part is not None},
         made={

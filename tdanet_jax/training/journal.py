@@ -159,7 +159,7 @@ def wandb_sink(folder: Path | str) -> Callable[[Row], None]:
     `folder`/wandb.
 
     The run is called as its folder is, in the project "tdanet_jax" unless WANDB_PROJECT is set, and
-    is continued by a run that is resumed. Others in folders of the same name are runs of their own.
+    is continued by a run that is resumed. Runs of the same name in other folders are kept apart.
 
     Raises:
       ValueError: Weights & Biases refuses the run.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -122,9 +121,9 @@ class Pools:
 
 
 class _Loading:
-    """A pool that a thread loads. It ends between two rooms if stopped, or if the process ends.
+    """A pool that a thread loads. It ends between two rooms if stopped.
 
-    Nothing cuts it off: a thread that is in native code when Python ends can crash the process.
+    Python can crash if it ends while the thread is in native code.
     """
 
     def __init__(self, number: int, load: Callable[[Progress], EnvParams]) -> None:
@@ -135,7 +134,6 @@ class _Loading:
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name="rooms", daemon=True)
         self._thread.start()
-        atexit.register(self.stop)
 
     def _run(self) -> None:
         try:
@@ -154,7 +152,6 @@ class _Loading:
 
     def result(self) -> EnvParams:
         self._thread.join()
-        atexit.unregister(self.stop)
         assert self._found is not None
         if isinstance(self._found, Exception):
             raise self._found
@@ -162,5 +159,4 @@ class _Loading:
 
     def stop(self) -> None:
         self._stopped = True
-        atexit.unregister(self.stop)
         self._thread.join(10.0)

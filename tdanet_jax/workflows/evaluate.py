@@ -67,7 +67,9 @@ def evaluate(
     if folder is not None:
         files.check_writable(folder)
         if (folder / CONFIG_FILE).exists():
-            raise ValueError(f"{folder}: is a run, with results of its own; choose another folder")
+            raise ValueError(
+                f"--out {folder}: is a run with results of its own; choose another folder"
+            )
     test = test or OWN_TASK
     test.check(policy, seed)
     if data is not None:

@@ -63,10 +63,10 @@ def train(
         many updates were not finite; one line that names it.
     """
     folder, callbacks = Path(folder), callbacks or Callbacks()
+    log = [log] if isinstance(log, str) else log
     if tensorboard:
         warnings.warn('use log=["tensorboard"]', DeprecationWarning, stacklevel=2)
         log = [*log, "tensorboard"]
-    log = [log] if isinstance(log, str) else log
     check_log(log)
     if resume:
         config = resumed(folder, config)
@@ -215,7 +215,7 @@ def _learn(
             " with a lower --pool-updates turns are shorter"
         )
     callbacks.on_note("compiling ...")
-    with callbacks.shield():
+    with callbacks.shield(), contextlib.closing(pools):
         if stops():
             return False
         for rows in chunks:

@@ -87,7 +87,7 @@ def test_an_episode(ask):
         ({"detections": [], "target": "mug", "rotation": "x"}, "line 7: rotation is not a number"),
         ({"detections": [], "target": "mug", "rotation": 30}, "rotation 30.0: not a multiple of"),
         ({"detections": [], "target": "mug", "horizon": 99}, "horizon 99.0: must be between -90"),
-        ({"detections": [], "horizon": 20}, "line 7: horizon is of an episode's first frame, with"),
+        ({"detections": [], "horizon": 20}, "line 7: horizon: only together with target"),
     ],
 )
 def test_a_line_that_is_no_frame_is_answered_by_an_error_and_changes_nothing(ask, frame, message):

@@ -202,8 +202,12 @@ def test_images_may_be_named_by_their_files(tmp_path: Path, files: tuple[str, st
 def test_images_that_ids_and_files_name_differently_are_refused(tmp_path: Path) -> None:
     files = {7: "8.jpg", 8: "7.jpg"}
     images = [{**image, "file_name": files[image["id"]]} for image in TRUTH["images"]]
-    with pytest.raises(FileError, match="ids of images and names of files do not agree"):
+    with pytest.raises(FileError, match="image 7: is the id of one image and the file name of an"):
         measured_noise.read_coco(*written(tmp_path, {**TRUTH, "images": images}, FOUND))
+    images = [{**image, "file_name": f"{image['id']}/1.jpg"} for image in TRUTH["images"]]
+    found = [{**one, "image_id": 1} for one in FOUND]
+    with pytest.raises(FileError, match="image 1: two images have this file name"):
+        measured_noise.read_coco(*written(tmp_path, {**TRUTH, "images": images}, found))
 
 
 @pytest.mark.parametrize(

@@ -150,6 +150,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("", "Missing from tdanet serve: --checkpoint RUN"),
         ("--checkpoint nowhere", "nowhere/config.json: no such file"),
         ("--checkpoint bare", "bare/checkpoints: no checkpoint"),
+        ("--checkpoint bare --grid-size 3", "--grid-size 3: must be from"),
         ("--checkpoint bare --turn 50", "--turn 50: choose one of 15, 30, 45, 60, 90"),
         ("--checkpoint bare --hfov 200 --vfov 50", "camera: hfov 200.0: must be between 5 and 180"),
         ("--checkpoint bare --hfov 60", "camera: give either vfov, in degrees, or aspect"),

@@ -129,7 +129,7 @@ def test_two_runs_are_compared_episode_by_episode(
 
 
 def test_a_run_is_no_folder_for_other_results(opinionated_run):
-    with pytest.raises(ValueError, match="is a run, with results of its own; choose another"):
+    with pytest.raises(ValueError, match="is a run with results of its own; choose another"):
         tdanet_jax.evaluate(opinionated_run, policy="greedy", out=opinionated_run)
 
 

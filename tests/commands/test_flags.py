@@ -748,7 +748,9 @@ def test_the_files_of_a_run_are_opened(
 def test_checkpoints_are_written_at_their_interval(minutes: float, saves: int) -> None:
     """In five minutes, after whose first and last moment there is one anyway."""
     config = TrainConfig(checkpoint_minutes=minutes)
-    run = SimpleNamespace(seconds=0.0, config=config, saved=[], pools=SimpleNamespace(unreached=0))
+    run = SimpleNamespace(
+        seconds=0.0, config=config, saved=[], pools=SimpleNamespace(unreached=0, close=int)
+    )
     run.wait_for_rooms, run.steps = lambda seconds: None, 0
     run.save = lambda: run.saved.append(run.seconds)
 

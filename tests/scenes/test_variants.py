@@ -120,12 +120,15 @@ def test_rooms_in_which_no_target_can_be_found_are_named(rooms: Rooms) -> None:
     assert survey.without_targets(Rooms(bare, None)) == [NAMES[1]]
 
 
-def test_variants_have_the_types_and_targets_that_their_rooms_came_with(rooms: Rooms) -> None:
+def test_variants_have_the_types_and_targets_that_their_rooms_came_with(
+    rooms: Rooms, tmp_path: Path
+) -> None:
     """Kettle is no target of the paper's, and an office no room type of iTHOR's."""
     first, second = rooms.scenes(NAMES[:2])
     office = dataclasses.replace(first, name="A1", room_type="office")
     for scene, targets in ((office, {}), (second, {second.room_type: ("Kettle", "Cabinet")})):
-        extras = Extras(targets=targets, parts={scene.name: "train"})
+        others = {"lab": ("Mug",)} if targets else {}  # of a type that is not varied
+        extras = Extras(targets=targets | others, parts={scene.name: "train"})
         given = Rooms(
             tabulation.build([scene], rooms.tables.classes, rooms.tables.targets),
             extras,
@@ -134,8 +137,10 @@ def test_variants_have_the_types_and_targets_that_their_rooms_came_with(rooms: R
         made = variants.make(given, [scene.name], [scene.name], 1, seed=3)
         assert made.tables.scenes == (f"{scene.name}-v01",)
         assert made.tables.room_types[made.tables.room_type[0]] == scene.room_type
-        assert made.extras is not None
-        assert made.extras.targets == targets
+        dataset.save_rooms(made, tmp_path / f"{scene.name}.npz")
+        back = dataset.load_rooms(tmp_path / f"{scene.name}.npz")
+        assert back.extras is not None
+        assert back.extras.targets == targets
         nothing = dataclasses.replace(extras, targets={"bedroom": ("Pillow",)})
         assert survey.without_targets(Rooms(made.tables, nothing)) == [f"{scene.name}-v01"]
 

@@ -42,6 +42,6 @@ class Compare:
         title = "bundled" if self.data is None else Path(self.data).stem[:11]
         own = Path(self.rooms).stem[:11]
         if own == title:
-            title, own = "compared", "given"
+            title, own = "bundled" if self.data is None else "--data", "rooms"
         columns = {title: other.tables.subset(chosen), own: given.tables}
         console.print(*survey.making(given), *room_statistics.table(columns), sep="\n")
