@@ -18,7 +18,6 @@ from typing import Any
 from tdanet_jax.config import CONFIG_FILE
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import jsons
-from tdanet_jax.training import run_file
 
 METRICS_FILE = "metrics.jsonl"
 CSV_FILE = "metrics.csv"
@@ -165,6 +164,8 @@ def wandb_sink(folder: Path | str) -> Callable[[Row], None]:
       ValueError: Weights & Biases refuses the run.
     """
     import wandb
+
+    from tdanet_jax.training import run_file  # imports JAX, which the command does later
 
     folder = Path(folder)
     name = folder.resolve().name

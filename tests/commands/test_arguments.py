@@ -169,7 +169,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint bare --scene FloorPlan1 --target Mug", "bare/checkpoints: no checkpoint"),
         ("--checkpoint bare --episode 3 --out full", "--out full: is a folder"),
         ("--checkpoint bare --episode 3 --out x.gif", "--out x.gif: end it in .html"),
-        ("--checkpoint bare --episode 3 --out full/file/a", "--out full/file/a: Not a directory"),
+        ("--checkpoint bare --episode 3 --out full/file/a.html", "full/file/a.html: Not a"),
         ("--checkpoint bare --episode x", "invalid literal for int() with base 10: 'x'"),
         ("--checkpoint bare --episode 3 --seed=-1", "--seed -1: must be between 0 and 4294967295"),
         (

@@ -210,7 +210,9 @@ def prepare_scenes(recorder: Recorder) -> None:
 
 
 def prepare_sweep(recorder: Recorder) -> None:
-    finished = SimpleNamespace(folder=Path("elsewhere"), results={"data_version": "d"})
+    finished = SimpleNamespace(
+        folder=Path("elsewhere"), results={"split": "18/4", "data_version": "d"}
+    )
     recorder.record("tdanet_jax.workflows.sweep.finished", gives=finished)
     recorder.record("tdanet_jax.training.devices.connect")
     recorder.record("tdanet_jax.training.devices.check_divides")
@@ -393,7 +395,10 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--done-bias": "--done-bias 1",
         },
     ),
-    "replay": (SHOW, {**ONE_EPISODE, "--shortest": "--shortest"}),
+    "replay": (
+        SHOW,
+        {**ONE_EPISODE, "--out": "--out other/a.html", "--shortest": "--shortest"},
+    ),
     "trajectories": (SHOW, {**ONE_EPISODE, "--shortest": "--shortest"}),
     "attention": (SHOW, ONE_EPISODE | {"--checkpoint": ("--checkpoint run", "--checkpoint other")}),
     # Without an episode, it plays the test episodes.
