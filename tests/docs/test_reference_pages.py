@@ -129,6 +129,29 @@ def test_the_readme_gives_the_means_of_three_seeds(split: str) -> None:
         assert f"{sr:.1f} / {spl:.1f} {group}" in readme
 
 
+def test_means_of_the_seeds_with_the_papers_inputs() -> None:
+    paths = ROOT.glob("results/18-4-paper-inputs-half-[012]/results.json")
+    found = [json.loads(path.read_text()) for path in paths]
+    assert len(found) == 3
+
+    def of_seeds(bucket: str, spread: bool) -> list[str]:
+        each = [
+            [results[group][bucket][measure] for results in found]
+            for group in ("seen", "unseen")
+            for measure in ("SR", "SPL")
+        ]
+        means = [f"{statistics.fmean(values):.1f}" for values in each]
+        if not spread:
+            return means
+        return [f"{m} ± {statistics.stdev(v):.1f}" for m, v in zip(means, each, strict=True)]
+
+    readme = (ROOT / "README.md").read_text()
+    assert f"256`, three seeds | {' | '.join(of_seeds('L>=1', spread=False))} |" in readme
+    told = " ".join(section("results", "The paper's inputs").split())
+    sr, spl, unseen_sr, unseen_spl = of_seeds("L>=5", spread=True)
+    assert f"L >= 5: seen SR {sr}, SPL {spl}; unseen SR {unseen_sr}, SPL {unseen_spl}." in told
+
+
 def test_means_of_the_seeds_on_split_14_8() -> None:
     paths = ROOT.glob("results/14-8-best-half-[012]/results.json")
     found = [json.loads(path.read_text()) for path in paths]
