@@ -72,28 +72,31 @@ def training_curves(
     """SR and SPL in the training rooms against environment steps, a line for each run.
 
     Args:
-      runs: a label and the rows of `metrics.jsonl` of each; runs of one label share a colour.
+      runs: a label and the rows of `metrics.jsonl` of each; runs of one label are drawn alike.
       title: above both panels.
       path: the picture's file.
       comment: unseen, in the file; it must be a PNG then.
     """
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    axes = figure.subplots(1, 2)
     labels = [*dict.fromkeys(label for label, _ in runs)]
+    listed = {label: textwrap.fill(in_figure(label), 120) for label in labels}
+    text_lines = sum(text.count("\n") + 1 for text in listed.values())
+    figure = Figure(figsize=(9, 3.8 + 0.19 * text_lines), layout="constrained")
+    axes = figure.subplots(1, 2)
+    styles = [(color, dashes) for dashes in ("-", "--", ":", "-.") for color in PALETTE]
     for axis, measure, name in zip(axes, MEASURES, ("success", "spl"), strict=True):
         for label, rows in runs:
             rates = 100 * np.array([row[name] for row in rows], float)  # None becomes NaN: a gap
-            color = PALETTE[labels.index(label) % len(PALETTE)]
-            axis.plot([row["steps"] / 1e6 for row in rows], rates, color=color, linewidth=1)
+            color, dashes = styles[labels.index(label) % len(styles)]
+            steps = [row["steps"] / 1e6 for row in rows]
+            axis.plot(steps, rates, dashes, color=color, linewidth=1)
         axis.set(xlabel="million environment steps", ylim=(0, 100), xlim=(0, None))
         axis.set(ylabel=f"{measure}, per cent, training rooms")
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
     figure.suptitle(_in_lines(title))
     lines = {label: line for (label, _), line in zip(runs, axes[0].lines, strict=True)}
-    figure.legend(
-        lines.values(), map(in_figure, lines), loc="outside lower center", ncols=2, frameon=False
-    )
+    names = [listed[label] for label in lines]
+    figure.legend(lines.values(), names, loc="outside lower left", fontsize=8, frameon=False)
     drawing.save(figure, path, DPI, comment)
 
 

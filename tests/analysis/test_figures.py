@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pytest
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from tdanet_jax.analysis import figures
+from tdanet_jax.analysis import drawing, figures
 from tdanet_jax.analysis.attention import ClassPairs
 
 
@@ -19,3 +23,23 @@ def test_class_pairs_are_drawn_even_if_there_are_none(tmp_path):
     figures.class_pairs(empty, set(), "Nothing", tmp_path / "none.png")
     for name in ("pairs.png", "none.png"):
         assert imread(tmp_path / name).std() > 0.01
+
+
+def test_training_curves_have_room_for_many_agents_and_long_names(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(drawing, "save", lambda figure, *_: drawn.append(figure))
+    rows = [{"steps": n, "success": 0.5, "spl": 0.25} for n in (1, 2)]
+    names = [f"tdanet --preset best --seed {n}" + " --extra-targets None" * 8 for n in range(20)]
+    figures.training_curves([(name, rows) for name in names], "Split", tmp_path / "a.png")
+    [figure] = drawn
+    figure.draw_without_rendering()
+    [legend] = figure.legends
+    box = legend.get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.width
+    assert 0 <= box.y0 < box.y1 <= figure.bbox.height
+    heights = {axis.get_window_extent().height for axis in figure.axes}
+    assert min(heights) > 2.5 * figure.dpi
+    looks = {(line.get_color(), line.get_linestyle()) for line in figure.axes[0].lines}
+    assert len(looks) == len(names)
