@@ -359,8 +359,9 @@ def find_targets(
     elif named:
         asked = targets.parse(text)
     if unknown := [room for room in asked if room and room not in tables.room_types]:
+        where = "--targets" if named else "the rooms' own targets:"
         raise ValueError(
-            f"--targets {unknown[0]}: no room type of these rooms; there are "
+            f"{where} {unknown[0]}: no room type of these rooms; there are "
             f"{', '.join(tables.room_types)}"
         )
     every = {name for name in tables.classes if is_plain(name)}

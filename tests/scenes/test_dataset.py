@@ -20,6 +20,7 @@ from tdanet_jax.scenes.dataset import Extras, PublishedEpisode, Rooms
 from tdanet_jax.scenes.offline import exporter
 from tdanet_jax.scenes.visibility.rules import RULES
 from tdanet_jax.splits import Split, make_split
+from tdanet_jax.targets import PAPER
 from tdanet_jax.vocabulary import ROOM_TYPES, TARGETS
 from tests.support import toy
 
@@ -411,3 +412,12 @@ def test_rooms_of_a_type_of_ones_own_are_described() -> None:
     assert float(found["L, mean"]) >= 1
     assert found["nearest target and furniture, median distance"] == "-"  # there is no furniture
     assert found["target classes that can be found in a room"] == "1.00"
+
+
+def test_targets_of_a_type_that_the_rooms_lack_are_not_blamed_on_a_flag(
+    some_rooms: SceneTables,
+) -> None:
+    """They come from a file, targets.json."""
+    rooms = Rooms(some_rooms, Extras(targets={"lounge": ("Mug",)}))
+    with pytest.raises(ValueError, match="^the rooms' own targets: lounge: no room type of these"):
+        dataset.find_targets(PAPER, rooms)
