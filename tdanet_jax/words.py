@@ -224,13 +224,13 @@ def _load_text(path: Path, wanted: Collection[str] | None = None) -> WordVectors
         if file.read(3) != codecs.BOM_UTF8:
             file.seek(0)
         for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b"")):
-            head = line.split(maxsplit=1)[0] if line.strip() else b""
+            head = b"".join(line.split(maxsplit=1)[:1]).decode("utf-8", "replace")
             if _is_left_out(head, number, wanted):
                 continue
             # Some words of GloVe 840B hold spaces: ". . ." or "at name@domain.com".
             parts = line.rsplit(maxsplit=len(rows[0])) if rows else line.split()
             word = b"".join(parts[:1]).decode("utf-8", "replace")
-            if _is_left_out(b"".join(parts[:1]), number, wanted):
+            if _is_left_out(word, number, wanted):
                 continue
             try:
                 row = np.array(parts[1:], np.float32)
@@ -252,13 +252,9 @@ def _load_text(path: Path, wanted: Collection[str] | None = None) -> WordVectors
     return WordVectors(index, np.stack(rows))
 
 
-def _is_left_out(word: bytes, number: int, wanted: Collection[str] | None) -> bool:
+def _is_left_out(word: str, number: int, wanted: Collection[str] | None) -> bool:
     """Whether a word, which is so far down in its file, is not taken."""
-    return (
-        wanted is not None
-        and number >= ASSET_WORDS
-        and word.decode("utf-8", "replace") not in wanted
-    )
+    return wanted is not None and number >= ASSET_WORDS and word not in wanted
 
 
 def _is_number(text: str) -> bool:

@@ -74,7 +74,7 @@ def _distances(tables: SceneTables) -> np.ndarray:
 
 def _episodes(tables: SceneTables) -> dict[str, str]:
     """L, and how often a uniformly random agent succeeds."""
-    asked = find_targets(PAPER, Rooms(tables, extras=None))[1]  # in room types of one's own, too
+    asked = find_targets(PAPER, Rooms(tables, extras=None))[1]  # of custom room types, too
     targets = {
         room: tuple(name for name in names if name in tables.targets)
         for room, names in asked.items()
