@@ -39,6 +39,7 @@ class Camera:
       aspect: width of the image over its height, instead of `vfov`.
       height: metres above the floor; only for `limits`.
       horizon: degrees that the camera looks down where the robot does not tilt it.
+      centre: where the optical axis meets the image, as shares of its width and height.
 
     Raises:
       ValueError: a value is out of range, or not exactly one of `vfov` and `aspect` is given.
@@ -49,6 +50,7 @@ class Camera:
     aspect: InitVar[float | None] = None
     height: float | None = None
     horizon: float = 0.0
+    centre: tuple[float, float] = (0.5, 0.5)
 
     def __post_init__(self, aspect: float | None) -> None:
         _check("hfov", self.hfov, *ANGLES)
@@ -63,6 +65,8 @@ class Camera:
         if self.height is not None:
             _check("height", self.height, 0, 100)
         _check("horizon", self.horizon, -90, 90)
+        for share in self.centre:
+            _check("centre", share, 0, 1)
 
     @classmethod
     def from_camera_info(
@@ -78,16 +82,17 @@ class Camera:
         old = hasattr(info, "K")  # ROS 1
         raw = info.K if old else info.k
         rectified: Sequence[float] = getattr(info, "P" if old else "p", ())
-        focal, size = (raw[0], raw[4]), (info.width, info.height)
+        focal, axis, size = (raw[0], raw[4]), (raw[2], raw[5]), (info.width, info.height)
         if len(rectified) == 12 and rectified[0] > 0 and rectified[5] > 0:
-            focal = rectified[0], rectified[5]
+            focal, axis = (rectified[0], rectified[5]), (rectified[2], rectified[6])
         if not all(value > 0 for value in (*focal, *size)):
             raise ValueError("CameraInfo: not calibrated, k or the size of the image is zero")
         hfov, vfov = (
             2 * math.degrees(math.atan(pixels / (2 * f)))
             for pixels, f in zip(size, focal, strict=True)
         )
-        return cls(hfov, vfov, height=height, horizon=horizon)
+        centre = axis[0] / info.width, axis[1] / info.height
+        return cls(hfov, vfov, height=height, horizon=horizon, centre=centre)
 
     def to_agent(
         self, detections: Iterable[Detection], horizon: float | None = None
@@ -126,11 +131,15 @@ class Camera:
             f"to {FIELD_OF_VIEW:.0f}: {100 * self.seen_share():.0f} % of their image"
         ]
         if self.height is not None:
+            up, down = (
+                math.degrees(math.atan(2 * share * math.tan(math.radians(self.vfov / 2))))
+                for share in (self.centre[1], 1 - self.centre[1])
+            )
             lowest, highest = (
                 max(self.height - distance * math.tan(math.radians(angle)), 0.0)
                 for angle in (
-                    min(self.horizon + self.vfov / 2, 89.9),
-                    max(self.horizon - self.vfov / 2, -89.9),
+                    min(self.horizon + down, 89.9),
+                    max(self.horizon - up, -89.9),
                 )
             )
             lines.append(
@@ -145,7 +154,7 @@ class Camera:
 
     def _rays(self, box: Detection) -> list[Ray]:
         """The directions of a box's corners, around it."""
-        return _rays(box, self.hfov, self.vfov or self.hfov)
+        return _rays(box, self.hfov, self.vfov or self.hfov, self.centre)
 
 
 def turned(
@@ -177,10 +186,12 @@ def _check(name: str, value: float, least: float, most: float) -> None:
         raise ValueError(f"camera: {name} {value}: must be between {least} and {most}")
 
 
-def _rays(box: Detection, hfov: float, vfov: float) -> list[Ray]:
+def _rays(
+    box: Detection, hfov: float, vfov: float, centre: tuple[float, float] = (0.5, 0.5)
+) -> list[Ray]:
     wide, high = math.tan(math.radians(hfov / 2)), math.tan(math.radians(vfov / 2))
-    x1, x2 = (wide * (2 * x - 1) for x in (box.x1, box.x2))
-    y1, y2 = (high * (2 * y - 1) for y in (box.y1, box.y2))
+    x1, x2 = (2 * wide * (x - centre[0]) for x in (box.x1, box.x2))
+    y1, y2 = (2 * high * (y - centre[1]) for y in (box.y1, box.y2))
     return [(x1, y1, 1.0), (x2, y1, 1.0), (x2, y2, 1.0), (x1, y2, 1.0)]
 
 

@@ -21,6 +21,7 @@ from tdanet_jax.sensors.shared import (
     HALF_CERTAIN,
     MAP_SIZE,
     MAX_RADIUS,
+    MOVED,
     POSITION_SCALE,
     PRIOR_WEIGHT,
     SAME_OBJECT_COSINE,
@@ -206,7 +207,7 @@ def _from_here(grid: PoseGrid, estimate: TargetEstimate, odometry: OdometryState
     x, z = odometry.step * grid.grid_size
     return estimate._replace(
         moment=estimate.moment - estimate.normal @ (x, 0.0, z),
-        moved=estimate.moved or bool(np.any(odometry.step)),
+        moved=estimate.moved or bool(np.hypot(*odometry.step) > MOVED),
     )
 
 

@@ -33,6 +33,9 @@ SAME_OBJECT_COSINE = float(np.cos(np.radians(12)))
 HALF_CERTAIN = 0.03
 #: Upper bound of a radius, in metres.
 MAX_RADIUS = 1.0
+#: Cells by which an agent must have moved to see its target from a new point: measured poses waver
+#: by some millimetres where it stands still.
+MOVED = 0.25
 #: Distances to the border of reach are divided by this many metres, and clipped there.
 BORDER = 0.25
 #: The square of an error over that of what is left of it once the estimate has followed the ray

@@ -26,6 +26,7 @@ from tdanet_jax.sensors.shared import (
     BORDER,
     HALF_CERTAIN,
     MAX_RADIUS,
+    MOVED,
     POSITION_SCALE,
     PRIOR_WEIGHT,
     SAME_OBJECT_COSINE,
@@ -66,7 +67,7 @@ class Triangulation(Sensor):
         moved = jnp.stack([x, jnp.zeros_like(x), z])
         return state.replace(
             moment=state.moment - dot(state.normal, moved),
-            moved=state.moved | jnp.any(cells != 0),
+            moved=state.moved | (cells[0] ** 2 + cells[1] ** 2 > MOVED**2),
         )
 
     def observe(

@@ -140,6 +140,15 @@ def test_the_aspect_gives_the_vertical_field_of_view():
     assert dataclasses.replace(camera, horizon=5) == Camera(90, camera.vfov, horizon=5)
 
 
+def test_the_optical_axis_need_not_meet_the_middle():
+    """Focal lengths of half of a side: what is on the axis is straight ahead."""
+    camera = Camera(90, 90, height=1.5, centre=(0.6, 0.45))
+    (seen,) = camera.to_agent([Detection("mug", 0.6, 0.45, 0.7, 0.55)])
+    assert (seen.x1, seen.y1, seen.x2, seen.y2) == pytest.approx((0.5, 0.5, 0.6, 0.6))
+    assert camera.seen_share() == pytest.approx(0.9 * 0.95)
+    assert camera.limits(1.0)[-1] == "1 m ahead, sees what is between 0.40 and 2.40 m high"
+
+
 @pytest.mark.parametrize("name", ["k", "K"])
 def test_the_camera_of_a_message_of_ros(name):
     info = SimpleNamespace(width=640, height=480, **{name: [320.0, 0, 319, 0, 320.0, 239, 0, 0, 1]})
@@ -151,6 +160,7 @@ def test_the_camera_of_a_message_of_ros(name):
     assert Camera.from_camera_info(info).hfov == pytest.approx(2 * math.degrees(math.atan(2)))
     info = SimpleNamespace(**vars(info) | {"p" if name == "k" else "P": [0.0] * 12})
     assert Camera.from_camera_info(info).hfov == pytest.approx(90)
+    assert camera.centre == pytest.approx((319 / 640, 239 / 480))
     empty = SimpleNamespace(width=0, height=0, k=[0.0] * 9)
     with pytest.raises(ValueError, match="CameraInfo: not calibrated"):
         Camera.from_camera_info(empty)
@@ -170,6 +180,7 @@ def test_the_camera_of_a_message_of_ros(name):
         ({"hfov": 69, "aspect": 0}, "camera: aspect 0: must be between 0 and 100"),
         ({"hfov": 69, "vfov": 55, "height": -1}, "camera: height -1: must be between"),
         ({"hfov": 69, "vfov": 55, "horizon": 95}, "camera: horizon 95: must be between -90 and 90"),
+        ({"hfov": 69, "vfov": 55, "centre": (0.5, 320)}, "camera: centre 320: must be between 0"),
     ],
 )
 def test_what_is_no_camera_is_refused_in_one_line(given_, message):

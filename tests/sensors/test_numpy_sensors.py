@@ -90,3 +90,24 @@ def test_a_step_leaves_the_states_before_it_as_they_were():
     assert after["odometry"].cells[0, 1] == 1
     np.testing.assert_array_equal(states["odometry"].cells, cells)
     assert not states["triangulation"].normal.any()
+
+
+@pytest.mark.parametrize("spec", [BOTH, ROBUST])
+def test_an_agent_whose_measured_pose_wavers_has_not_moved(spec):
+    """It turns in one place, and its bearings err by degrees: further rays do not count."""
+    rng = np.random.default_rng(0)
+    theirs = suite.init(spec, Start(jnp.int32(0), jnp.int32(0), NO_SLIP))
+    ours, said = numpy_sensors.init(spec, 0, 0, True), []
+    for number in range(7):
+        turned = 45 * (number > 0) * (-1) ** number  # to and fro, the target always in view
+        action = (6, Action.ROTATE_LEFT, Action.ROTATE_RIGHT)[(number > 0) * (1 + number % 2)]
+        pose = measured_pose(spec.grid, 0, *rng.normal(scale=0.002, size=2), turned)
+        boxes = np.array([[0.5 + rng.normal(scale=0.03), 0.5, 0.01]])
+        frame = Frame(np.zeros(1, int), boxes, np.ones(1, bool), np.int32(0))
+        motion = Motion(jnp.int32(action), jnp.array(False), measured=pose)
+        theirs, features = step(spec, theirs, motion, jnp.array(False), frame)
+        ours = numpy_sensors.after(spec, ours, action, False, pose, False, boxes)
+        found = numpy_sensors.features(spec, ours)
+        said += [found[-5], features[-5]]  # the certainty
+    np.testing.assert_allclose(said, said[0], rtol=1e-3)
+    assert np.linalg.norm(found[-9:-6]) == pytest.approx(1.5 / 4, rel=0.01)  # as after the first
