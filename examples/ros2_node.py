@@ -21,6 +21,9 @@ import math
 
 import rclpy
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.time import Time
@@ -41,9 +44,12 @@ class NavigatorNode(Node):
         super().__init__("navigator")
         self.agent = tdanet_jax.load(self.declare_parameter("agent", "agents/18-4-best").value)
         #: Degrees that the camera looks down.
-        self.horizon = self.declare_parameter("horizon", 0.0).value
-        #: Actions that the robot cannot do.
-        self.forbid = tuple(filter(None, self.declare_parameter("forbid", [""]).value))
+        number = ParameterDescriptor(dynamic_typing=True)  # 30 or 30.0
+        self.horizon = float(self.declare_parameter("horizon", 0.0, number).value)
+        #: What the robot can do: without the actions in `forbid`.
+        forbid = self.declare_parameter("forbid", [""]).value
+        self.config = NavigatorConfig(forbid=tuple(filter(None, forbid)))
+        self.config.check()
         #: What class_id means where it is a number.
         self.names = [*filter(None, self.declare_parameter("names", [""]).value)] or None
         self.nav: Navigator | None = None
@@ -65,7 +71,7 @@ class NavigatorNode(Node):
         if self.nav is None:
             camera = Camera.from_camera_info(info, horizon=self.horizon)
             self.info = info
-            self.nav = Navigator(self.agent, camera, NavigatorConfig(forbid=self.forbid))
+            self.nav = Navigator(self.agent, camera, self.config)
             self.get_logger().info("; ".join(camera.limits()))
 
     def on_odom(self, odometry: Odometry) -> None:
@@ -113,7 +119,9 @@ def main() -> None:
     rclpy.init()
     try:
         rclpy.spin(NavigatorNode())
-    except ValueError as error:  # no such agent, a camera without calibration
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (ValueError, ParameterException) as error:  # no such agent, an uncalibrated camera
         raise SystemExit(f"error: {error}") from None
 
 

@@ -71,7 +71,7 @@ class LearnerConfig:
     final_entropy_weight: float = 0.01
     """Weight of the entropy at the end of the budget; changes linearly."""
     value_weight: float = 0.5
-    """Weight of the value loss, the squared error."""
+    """Weight of the value loss, half the squared error."""
     imitation_weight: float = 0.0
     """Initial weight of imitation in the loss: minus the logarithm of the probability, among all
     actions but Done, of the moves that begin a shortest path to the target, once it has been seen.
@@ -218,9 +218,9 @@ class TrainConfig:
     """Requires --generated. Train in generated rooms alone. Parents of targets and the class graph
     are those of the training rooms in any case."""
     pool_rooms: int = 1500
-    """Most variants and generated rooms of a pool. If there are more, pools take turns: the first,
-    the present and the next one are in memory, and the next is built or loaded meanwhile. They are
-    made of files of 100 generated rooms, or of a variant of each room."""
+    """Variants and generated rooms of a pool, about: pools are made of whole files of 100 generated
+    rooms, or of a variant of each room. If there are more rooms, pools take turns: the first, the
+    present and the next one are in memory, and the next is built or loaded meanwhile."""
     pool_updates: int = 800
     """Updates in a pool before the next one's turn, rounded to whole calls of --chunk-updates."""
     chunk_updates: int = 10

@@ -112,7 +112,7 @@ ITHOR = "ithor-"
 
 
 def make(
-    name: str = "ithor-18/4",
+    name: str | None = None,
     split: Literal["train", "test"] = "train",
     config: TrainConfig | None = None,
 ) -> tuple[Environment, EnvParams]:
@@ -120,22 +120,24 @@ def make(
 
     Args:
       name: "ithor-" and the seen/unseen split, as of `TrainConfig.split`: "ithor-22/0",
-        "ithor-18/4", "ithor-14/8", or the unseen classes, "ithor-Mug,Vase,CD,Towel".
+        "ithor-18/4", "ithor-14/8", or the unseen classes, "ithor-Mug,Vase,CD,Towel". By
+        default, the split of `config`, which without one is 18/4.
       split: "train" has the training rooms and no trace of unseen classes; "test" begins episodes
         in the test rooms, for seen and unseen targets, with the step limits of tests.
-      config: what else can be set: sensors, rows, step limit, rewards, rooms of your own. Its
-        `split` is replaced by the name's. All variants and generated rooms are in one pool.
+      config: what else can be set: sensors, rows, rooms of your own; and in training rooms also the
+        step limit, the partial reward and noise, where tests have their own. A name's split
+        replaces that of `config`. All variants and generated rooms are in one pool.
 
     Raises:
       ValueError: no environment has this name, or a file of the configuration is broken.
     """
+    config = config or TrainConfig()
+    name = f"{ITHOR}{config.split}" if name is None else name
     if not name.startswith(ITHOR):
         raise ValueError(f"{name}: no such environment; try {ITHOR}18/4")
     if split not in ("train", "test"):
         raise ValueError(f"split {split!r}: must be 'train' or 'test'")
-    config = dataclasses.replace(
-        config or TrainConfig(), split=name.removeprefix(ITHOR), pool_rooms=ALL_ROOMS
-    )
+    config = dataclasses.replace(config, split=name.removeprefix(ITHOR), pool_rooms=ALL_ROOMS)
     config.check()
     if split == "test":  # not without added rooms: observations have as many rows as these need
         config = dataclasses.replace(config, extra_targets=None)

@@ -6,6 +6,7 @@ Sources: as in MJOLNIR (Qiu et al. 2020), SSNet (Zhao et al. 2023) and TDANet (L
 from __future__ import annotations
 
 import re
+import unicodedata
 from enum import IntEnum
 
 
@@ -48,7 +49,8 @@ def class_words(name: str) -> tuple[str, ...]:
     """The lower-case words of a class name or label: "CoffeeMachine" -> ("coffee", "machine").
 
     A run of capitals is one word ("CD", "TVStand" -> tv, stand); spaces, underscores and hyphens
-    separate as well.
+    separate as well. Letters lose their accents: "café table" -> cafe, table.
     """
+    name = "".join(c for c in unicodedata.normalize("NFKD", name) if not unicodedata.combining(c))
     pattern = r"[A-Z]+(?![a-z])|[A-Z][a-z]+|[a-z]+|[0-9]+"
     return tuple(word.lower() for word in re.findall(pattern, name))

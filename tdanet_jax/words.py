@@ -96,18 +96,20 @@ class WordVectors:
                 meant[name] = None
         return {name: meaning for name, meaning in meant.items() if meaning is not None}
 
-    def extended(self, more: WordVectors, source: Path | str = "words") -> WordVectors:
-        """With the words of others that it lacks, after its own.
+    def extended(self, more: Mapping[str, Sequence[float]] | Path | str) -> WordVectors:
+        """With further words, as `read_words` takes them, after its own; none is replaced.
 
         Raises:
-          ValueError: their vectors are of another length; the message begins with `source`.
+          ValueError: they cannot be read, or their vectors are of another length; the message
+            begins with the file, or "words".
         """
-        width, others = self.vectors.shape[1], more.vectors.shape[1]
-        if width != others:
-            raise FileError(source, f"vectors of {others} numbers, where the others have {width}")
-        new = [word for word in more.index if word not in self.index]
+        others, width = read_words(more), self.vectors.shape[1]
+        if width != (other := others.vectors.shape[1]):
+            source = "words" if isinstance(more, Mapping) else more
+            raise FileError(source, f"vectors of {other} numbers, where the others have {width}")
+        new = [word for word in others.index if word not in self.index]
         index = self.index | {word: len(self.index) + i for i, word in enumerate(new)}
-        rows = more.vectors[[more.index[word] for word in new]]
+        rows = others.vectors[[others.index[word] for word in new]]
         return WordVectors(index, np.concatenate([self.vectors, rows]))
 
     def save_copy(self, path: Path | str, names: Iterable[str]) -> None:

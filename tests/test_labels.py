@@ -57,6 +57,11 @@ def test_every_name_of_coco_is_accepted(of_agents: Labels, glove: WordVectors) -
             assert meaning == label
 
 
+def test_letters_lose_their_accents() -> None:
+    for label, words in (("café table", ("cafe", "table")), ("Tür", ("tur",))):
+        assert class_words(label) == words
+
+
 def spellings(name: str) -> list[str]:
     words = class_words(name)
     plain = [

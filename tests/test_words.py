@@ -224,14 +224,13 @@ def test_a_copy_has_the_classes_exactly_and_the_other_words_in_16_bits(
 
 
 def test_further_words_come_after_those_that_are_there() -> None:
-    more = words.read_words({"Mug": [9.0, 9.0], "wine rack": [1, 2], "Zwieback": (0.5, 0.25)})
-    found = SMALL.extended(more)
+    found = SMALL.extended({"Mug": [9.0, 9.0], "wine rack": [1, 2], "Zwieback": (0.5, 0.25)})
     assert list(found.index) == ["coffee", "machine", "mug", "wine rack", "zwieback"]
     np.testing.assert_array_equal(found.vectors[:3], SMALL.vectors)
     np.testing.assert_array_equal(found.embed("WineRack", None), [1, 2])
     assert len(SMALL.index) == 3
     with pytest.raises(ValueError, match="words: vectors of 3 numbers, where the others have 2"):
-        SMALL.extended(words.read_words({"zwieback": [1, 2, 3]}))
+        SMALL.extended({"zwieback": [1, 2, 3]})
 
 
 def test_all_words_of_a_file_are_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

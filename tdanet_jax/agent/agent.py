@@ -216,6 +216,13 @@ class Agent(BaseAgent):
         self._table = None
         return added
 
+    def check_input(self) -> None:
+        """As `BaseAgent.check_input`."""
+        if self.model.encoder.IMAGE:
+            raise ValueError(
+                f"{self.config.model} needs an image; an agent is shown detections alone"
+            )
+
     def _checked(
         self,
         state: AgentState,
@@ -224,10 +231,7 @@ class Agent(BaseAgent):
         forbidden: Collection[Action],
     ) -> None:
         """Raises ValueError if the arguments of `act` do not go together."""
-        if self.model.encoder.IMAGE:
-            raise ValueError(
-                f"{self.config.model} needs an image; an agent is shown detections alone"
-            )
+        self.check_input()
         odometry = state.sensors.get("odometry")
         measured = odometry is not None and odometry.deviation is not None
         self._check(int(state.action), measured, blocked, pose, forbidden)
@@ -367,8 +371,7 @@ def load(
     path = find_word_vectors(config, folder_of(run), word_vectors)
     vectors = words.load_word_vectors(path, classes.names)
     if more_words is not None:
-        source = "words" if isinstance(more_words, Mapping) else more_words
-        vectors = vectors.extended(words.read_words(more_words), source)
+        vectors = vectors.extended(more_words)
     agent = Agent(config, weights, vectors, classes, grid, synonyms)
     shape = max(len(classes.names), 1), vectors.vectors.shape[1]
     expected, width = agent.model.parameter_shapes(*shape), None if path is None else shape[1]

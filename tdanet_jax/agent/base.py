@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tdanet_jax import words
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.labels import LabelError, Labels, Synonyms
 from tdanet_jax.observation_spec import ObservationSpec
@@ -96,6 +95,9 @@ class BaseAgent:
         """The `key` with which `act` samples an action; another one for each seed and step."""
         raise NotImplementedError
 
+    def check_input(self) -> None:
+        """Raises ValueError if the network needs more than detections to act."""
+
     def knows(self, label: str) -> bool:
         """Whether a label has a meaning (`labels`), so that it can be detected or looked for."""
         try:
@@ -119,8 +121,7 @@ class BaseAgent:
           ValueError: the file cannot be read, something is not a vector, or vectors are of another
             length; the agent stays as it was.
         """
-        source = "words" if isinstance(more, Mapping) else more
-        vectors = self._vectors.extended(words.read_words(more), source)
+        vectors = self._vectors.extended(more)
         added = len(vectors.index) - len(self._vectors.index)
         named = tuple(vectors.described(self._names))
         self.labels = Labels(named, vectors.index, self._synonyms)
@@ -173,7 +174,7 @@ class BaseAgent:
           ValueError: they do not.
         """
         if self.spec.sensors and blocked is None and action == Action.MOVE_AHEAD:
-            raise ValueError("the agent has odometry: say whether its MoveAhead was `blocked`")
+            raise ValueError("the agent has sensors: say whether its MoveAhead was `blocked`")
         if len({*forbidden}) >= NUM_ACTIONS:
             raise ValueError("every action is forbidden")
         if "odometry" in self.spec.sensors and measured != (pose is not None):

@@ -88,10 +88,11 @@ def _supervision(detections: Any, image_size: Any, names: Names | None) -> list[
     classes = detections.class_id if given is None else given
     if classes is None:
         raise ValueError("supervision: the detections have neither class_name nor class_id")
-    labels = [_label("supervision", cls, names) for cls in classes.tolist()]
+    listed = classes if isinstance(classes, list) else classes.tolist()
+    labels = [_label("supervision", cls, names) for cls in listed]
     scores = detections.confidence
-    listed = [None] * len(boxes) if scores is None else scores.tolist()
-    return in_image(zip(labels, boxes, listed, strict=True), width, height)
+    rated = [None] * len(boxes) if scores is None else scores.tolist()
+    return in_image(zip(labels, boxes, rated, strict=True), width, height)
 
 
 def _torchvision(

@@ -151,10 +151,12 @@ def read_coco(
         name: _entries(truth, whole.get(name) if isinstance(whole, dict) else None, f"{name}: ")
         for name in ("images", "annotations", "categories")
     }
-    names = {
-        _key(truth, f"categories, {i}", one, "id"): str(one.get("name"))
-        for i, one in enumerate(lists["categories"])
-    }
+    names: dict[Any, str] = {}
+    for i, one in enumerate(lists["categories"]):
+        key = _key(truth, f"categories, {i}", one, "id")
+        if not isinstance(name := one.get("name"), str):
+            raise FileError(truth, f"categories, {i}, name: not a string")
+        names[key] = name
     sizes: dict[Any, list[float]] = {}
     by_file: dict[int | str, Any] = {}  # image ids as ultralytics writes them
     twice: set[int | str] = set()
@@ -165,9 +167,9 @@ def read_coco(
         sizes[number] = [jsons.number(truth, one.get(n), f"{at}, {n}", 1e5) for n in _SIZE]
         there[number] = []
         if isinstance(one.get("file_name"), str):
-            name = _number_of(Path(one["file_name"]).stem)
-            twice |= {name} & {*by_file}
-            by_file[name] = number
+            stem = _number_of(Path(one["file_name"]).stem)
+            twice |= {stem} & {*by_file}
+            by_file[stem] = number
         if min(sizes[number]) <= 0:
             raise FileError(truth, f"{at}: width and height must be positive")
     seen: dict[Any, list[Detection]] = {number: [] for number in there}

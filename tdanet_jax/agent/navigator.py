@@ -88,6 +88,7 @@ class Navigator:
         config: NavigatorConfig = NavigatorConfig(),
     ) -> None:
         config.check()
+        agent.check_input()
         self.agent = agent
         self.camera = camera or Camera(FIELD_OF_VIEW, FIELD_OF_VIEW)
         self.config = config

@@ -241,6 +241,7 @@ def load(
     grid: PoseGrid = ITHOR,
     synonyms: Synonyms | Path | str | None = None,
     decisions: Decisions = OWN_DECISIONS,
+    more_words: Mapping[str, Sequence[float]] | Path | str | None = None,
 ) -> NumPyAgent:
     """An exported agent.
 
@@ -249,10 +250,11 @@ def load(
       grid: the turns and steps of the world in which the agent acts, if it has sensors.
       synonyms: other names of things, {"Mug": ["beaker"]}, or a JSON file of them.
       decisions: how the agent decides, in place of the run's settings.
+      more_words: further words, as for `add_words`; synonyms may be of these, too.
 
     Raises:
       ValueError: a file is missing, damaged or does not fit the others, and the message names it;
-        or `decisions` do not fit the agent.
+        or `decisions` or `more_words` do not fit the agent.
     """
     folder = Path(folder)
     meta = _read_meta(folder / META_FILE)
@@ -261,6 +263,8 @@ def load(
         raise ValueError(f"--reach-threshold: {folder} was trained without it")
     meta = dataclasses.replace(meta, **decisions.replaced)
     vectors = words.load_word_vectors(folder / WORDS_FILE)
+    if more_words is not None:
+        vectors = vectors.extended(more_words)
     weights = npz.read(folder / MODEL_FILE)
     expected = shapes(meta, vectors.vectors.shape[1])
     for name in sorted({*weights, *expected}):

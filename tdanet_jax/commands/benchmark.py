@@ -47,7 +47,7 @@ Part = Literal[
     "evaluation", "decision", "agent", "quality",
 ]  # fmt: skip
 #: The parts of training.
-TRAINED = {"rollout", "update", "profile"}
+TRAINED = ("rollout", "update", "profile")
 #: The agent of the `agent` part.
 BUNDLED = "18-4-best"
 #: What is measured if `--parts` is not given: all that takes no training.
@@ -120,6 +120,23 @@ class Command:
         chosen = dataclasses.replace(chosen, learner=learner, network=network)
         return [dataclasses.replace(chosen, seed=seed, data=self.data) for seed in self.seeds]
 
+    def check_parts(self) -> None:
+        """Raises ValueError if a flag is given that none of the `parts` heeds."""
+        quality = ("preset", "num_envs", "units", "seeds", "most_steps")
+        for names, parts in (
+            (("odometry", "triangulation", "models"), (*TRAINED, "decision")),
+            (("batches", "precisions"), TRAINED),
+            (("environments", "devices"), ("environment",)),
+            (("networks",), ("evaluation",)),
+            (("checkpoint",), ("evaluation", "agent")),
+            (quality, ("quality",)),
+        ):
+            for name in names:
+                given = getattr(self, name) != getattr(Command, name)
+                if given and not {*parts} & {*self.parts}:
+                    flag, known = name.replace("_", "-"), ", ".join(parts)
+                    raise ValueError(f"--{flag}: needs one of these among --parts: {known}")
+
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
@@ -141,8 +158,7 @@ def main(arguments: list[str] | None = None) -> None:
             config.check()
         for name in command.models:
             command.config(name).check()
-        if command.odometry and not {*TRAINED, "decision"} & set(command.parts):
-            fail("--odometry: give --parts that have a model: rollout, update, profile or decision")
+        command.check_parts()
         if command.checkpoint is not None:
             from tdanet_jax.evaluation import saved_networks
 
@@ -226,7 +242,7 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
     operations = 0
     if "update" in command.parts:
         operations = benchmarking.operations_per_step(load_task(command.config(name, "float32")))
-    for asked in command.precisions if TRAINED & set(command.parts) else ():
+    for asked in command.precisions if {*TRAINED} & {*command.parts} else ():
         task = load_task(command.config(name, asked))
         precision = jnp.dtype(task.model.dtype).name
         if precision in measured:  # some models always multiply in float32

@@ -33,6 +33,7 @@ from tdanet_jax.commands.console import (
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.eval_config import OWN_TASK, EvalConfig
 from tdanet_jax.io import files
+from tdanet_jax.io.bundled_agents import folder_of
 from tdanet_jax.sense_noise import SWEEP, SWEEP_FILE
 
 
@@ -95,6 +96,9 @@ def main(arguments: list[str] | None = None) -> None:
         test.check(command.policy, command.seed)
         if not trained:
             test.with_targets(dataclasses.replace(config, data=test.data)).check()
+        for run in command.checkpoint:
+            if folder_of(run) != run:
+                fail(f"--checkpoint {run}: give the run; --history plays the points of its history")
         kind = f"noise-{command.policy}" if sweep else command.policy
         kind = f"history-{command.policy}" if command.history else kind
         folder = command.out or (*map(folder_for, command.checkpoint), Path("runs"))[0] / kind

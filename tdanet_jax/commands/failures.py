@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -86,8 +87,8 @@ def _write(command: Command, out: Path) -> None:
     shown = {f"episode-{f.episode}.html": f for f in failures.examples(summary, command.replays)}
     pages = _pages(command, rooms, {name: records[f.episode] for name, f in shown.items()})
     out.mkdir(parents=True, exist_ok=True)
-    for old in out.glob("episode-*.html"):
-        old.unlink()
+    for old in _listed(out / "failures.md"):  # and not what someone else has put there
+        (out / old).unlink(missing_ok=True)
     for name, page in pages.items():
         files.write_text(out / name, page)
     figures.failures(summary, out / "failures.png")
@@ -96,6 +97,12 @@ def _write(command: Command, out: Path) -> None:
     _print(summary)
     written = "failures.md, .json and .png"
     console.print(f"wrote {out / written}" + (f" and {len(pages)} replays" if pages else ""))
+
+
+def _listed(report: Path) -> list[str]:
+    """The pages that an earlier report links to."""
+    text = report.read_text(encoding="utf-8", errors="replace") if report.is_file() else ""
+    return re.findall(r"\((episode-\d+\.html)\)", text)
 
 
 def _pages(command: Command, rooms: Rooms, chosen: Mapping[str, Recorded]) -> dict[str, str]:

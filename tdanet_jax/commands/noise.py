@@ -11,9 +11,10 @@ can then be evaluated and trained with the noise of the detector that they will 
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from pathlib import Path
 
-from tdanet_jax.commands.console import console, one_line_errors, parse
+from tdanet_jax.commands.console import console, fail, one_line_errors, parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +35,9 @@ def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
         command = parse(Command, arguments, prog="tdanet noise", description=__doc__)
+        for name, value in (("min-score", command.min_score), ("iou", command.iou)):
+            if not 0 <= value <= 1:
+                fail(f"--{name} {value}: must be from 0 to 1")
         from tdanet_jax.agent import measured_noise
 
         there, seen = measured_noise.read_coco(command.truth, command.found, command.min_score)
@@ -44,3 +48,9 @@ def main(arguments: list[str] | None = None) -> None:
             f"{found.invented:,} false positives"
         )
         console.print(f"--noise {found.noise}")
+        if found.mislabelled > found.found / 2:
+            warnings.warn(
+                f"most labels are wrong: do {command.truth} and {command.found} number categories "
+                "alike? ultralytics writes the model's numbers, from 1 (older versions from 0)",
+                stacklevel=1,
+            )

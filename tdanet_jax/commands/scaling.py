@@ -43,7 +43,7 @@ class Command:
     """Numbers of training rooms; there are 80."""
     classes: tuple[int, ...] = (117, 250, 500, 1000, 2000)
     """Sizes of the vocabulary; at least 117."""
-    detections: tuple[int, ...] = (74, 128, 256, 512)
+    detections: tuple[int, ...] = (80, 128, 256, 512)
     """Rows of an observation; at least as many as a frame has detections."""
     repeats: int = 3
     """Timed repetitions of each figure."""
@@ -77,20 +77,34 @@ def scale(command: Command) -> None:
     task = make_task(TrainConfig(), scenes.load_tables(), words.load_bundled())
     sizes = ("environments", "rooms", "classes", "detections")
     total = sum(len(getattr(command, size)) for size in sizes)
-    rows = []
-    with reporter("measuring", transient=True) as show:
-        for row in measure(command, task):
-            rows.append(row)
-            show(len(rows) / total, f"{row['size']} {row['value']}")
+    rows, path = [], command.out / "scaling.jsonl"
+    measured = measure(command, task)
     command.out.mkdir(parents=True, exist_ok=True)
-    path = command.out / "scaling.jsonl"
-    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    with reporter("measuring", transient=True) as show, path.open("w") as file:
+        for row in measured:
+            rows.append(row)
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+            show(len(rows) / total, f"{row['size']} {row['value']}")
     figures.scaling(rows, command.out / "scaling.png")
     console.print(f"wrote {path} and {command.out / 'scaling.png'}")
 
 
 def measure(command: Command, task: Task) -> Iterator[Row]:
-    """A row for every size and value."""
+    """A row for every size and value.
+
+    Raises:
+      ValueError: a size is smaller than what the rooms need.
+    """
+    needed = {"classes": len(task.train_words), "detections": task.train_params.max_detections}
+    for size, least in needed.items():
+        for value in getattr(command, size):
+            if value < least:
+                raise ValueError(f"--{size} {value}: the rooms need at least {least}")
+    return _measured(command, task)
+
+
+def _measured(command: Command, task: Task) -> Iterator[Row]:
     import jax.numpy as jnp
 
     from tdanet_jax.config import LearnerConfig
@@ -98,10 +112,6 @@ def measure(command: Command, task: Task) -> Iterator[Row]:
 
     count = LearnerConfig().num_envs
     model, words, params = task.model, task.train_words, task.train_params
-    for size, least in (("classes", len(words)), ("detections", params.max_detections)):
-        for value in getattr(command, size):
-            if value < least:
-                raise ValueError(f"--{size} {value}: the rooms need at least {least}")
 
     def row(size: str, value: int, words: jax.Array, params: EnvParams, count: int) -> Row:
         return {"size": size, "value": value} | update_cost(

@@ -24,7 +24,7 @@ import tyro
 
 from tdanet_jax.agent.camera import Camera
 from tdanet_jax.agent.navigator import Navigator, NavigatorConfig
-from tdanet_jax.commands.console import RunPath, one_line_errors, parse
+from tdanet_jax.commands.console import RunPath, fail, one_line_errors, parse
 from tdanet_jax.decisions import OWN_DECISIONS, Decisions
 from tdanet_jax.poses import ITHOR, SIZES, TURNS, PoseGrid
 
@@ -90,6 +90,8 @@ def main(arguments: list[str] | None = None) -> None:
     with one_line_errors():
         command = parse(Command, arguments, prog="tdanet serve", description=__doc__)
         command.navigator.check()
+        if command.decisions.temperature is not None and command.navigator.seed is None:
+            fail("--temperature: has no effect without --seed")
         camera, grid = command.camera, command.grid
         from tdanet_jax.agent import load
         from tdanet_jax.training import devices

@@ -139,6 +139,8 @@ def share(command: Command, configs: Sequence[TrainConfig]) -> list[TrainConfig]
         return [*configs]
     if command.report_only:
         fail("--shard: --report-only trains nothing, and reports on all runs")
+    if command.include:
+        fail("--include: --shard reports nothing; give it with --report-only, when all are done")
     number, _, count = command.shard.partition("/")
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         fail(f"--shard {command.shard}: must be I/N, I from 1 to N")
@@ -149,7 +151,7 @@ def share(command: Command, configs: Sequence[TrainConfig]) -> list[TrainConfig]
 def alike(command: Command) -> Callable[[TrainConfig], Any]:
     """The key of runs that are trained in one call, which follow one another."""
     if command.vmap_seeds:
-        return lambda config: (config.split, config.model)
+        return lambda config: (config.split, config.model, config.network.precision)
     return lambda config: config
 
 
@@ -237,7 +239,6 @@ def train_all(
     """
     from tdanet_jax.models.classes import ClassVocabulary
     from tdanet_jax.models.factory import make_model
-    from tdanet_jax.task import resolve
     from tdanet_jax.training import devices
 
     cluster.leave()  # each share has runs of its own
@@ -245,10 +246,11 @@ def train_all(
     devices.keep_compiled()
     todo = []
     # A clash, or a model that cannot be made, shows before anything trains.
-    for config in map(resolve, configs):
+    for asked in configs:
+        folder = command.out / run_name(asked)
+        config = sweep.settled(folder, asked)
         make_model(config, ClassVocabulary())
         devices.check_divides(config.learner.num_envs, mesh)
-        folder = command.out / run_name(config)
         if sweep.progress(folder, config) != "finished":
             todo.append((config, folder))
     console.print(f"{len(configs)} runs, {len(configs) - len(todo)} finished, {len(todo)} to train")

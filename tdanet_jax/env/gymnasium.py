@@ -49,7 +49,11 @@ class _Shown:
     """
 
     def __init__(
-        self, name: str, split: Literal["train", "test"], flat: bool, config: TrainConfig | None
+        self,
+        name: str | None,
+        split: Literal["train", "test"],
+        flat: bool,
+        config: TrainConfig | None,
     ) -> None:
         self.env, self.params = make(name, split, config)
         self.flat = FlatObservations(self.env) if flat else None
@@ -93,7 +97,8 @@ class NavigationEnv(gymnasium.Env):
     """One episode at a time.
 
     Args:
-      name: of an environment, as `tdanet_jax.make` takes it: "ithor-18/4".
+      name: of an environment, as `tdanet_jax.make` takes it: "ithor-14/8"; by default, that of the
+        configuration's split.
       split: "train" or "test" rooms.
       flat: observations are vectors with word vectors filled in (`FlatObservations`), or else
         dictionaries: class indices, boxes, mask and target, without further sensors.
@@ -107,7 +112,7 @@ class NavigationEnv(gymnasium.Env):
 
     def __init__(
         self,
-        name: str = "ithor-18/4",
+        name: str | None = None,
         split: Literal["train", "test"] = "train",
         flat: bool = True,
         config: TrainConfig | None = None,
@@ -175,7 +180,7 @@ class NavigationVectorEnv(VectorEnv):
     def __init__(
         self,
         num_envs: int = 1,
-        name: str = "ithor-18/4",
+        name: str | None = None,
         split: Literal["train", "test"] = "train",
         flat: bool = True,
         config: TrainConfig | None = None,

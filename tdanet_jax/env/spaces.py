@@ -49,6 +49,8 @@ class Box:
             return jax.random.normal(key, self.shape).astype(self.dtype)
         if jnp.issubdtype(self.dtype, jnp.integer):
             return jax.random.randint(key, self.shape, self.low, self.high + 1, self.dtype)
+        if jnp.issubdtype(self.dtype, jnp.bool_):
+            return jax.random.bernoulli(key, shape=self.shape)
         drawn = jax.random.uniform(key, self.shape, minval=self.low, maxval=self.high)
         return drawn.astype(self.dtype)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.resources
 import json
 import subprocess
@@ -198,8 +199,12 @@ def _summary(column: Columns) -> dict[str, dict[str, Any]]:
 _HEAD = ("split", "model", "policy", "episodes_trained")
 
 
+@functools.cache
 def code_version() -> str:
-    """The commit of the checkout that the code runs from, else the package's version."""
+    """The commit of the checkout that the code runs from, else the package's version.
+
+    Of the first call: what a process runs does not change if the checkout does.
+    """
     here = Path(str(importlib.resources.files(tdanet_jax))).parent
     if (here / ".git").exists():
         command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12"]

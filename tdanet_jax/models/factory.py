@@ -87,4 +87,5 @@ def unused_flags(config: TrainConfig, classes: ClassVocabulary) -> list[str]:
     names = (field.name for field in dataclasses.fields(network) if field.name not in always_used)
     chosen = [name for name in names if getattr(network, name) != getattr(default, name)]
     flags = [f"--{name.replace('_', '-')}" for name in chosen if is_unused(name)]
-    return [*flags, "--size-noise"] if config.learner.size_noise and model.encoder.IMAGE else flags
+    no_boxes = model.encoder.IMAGE and model.encoder.ROWS is None
+    return [*flags, "--size-noise"] if config.learner.size_noise and no_boxes else flags

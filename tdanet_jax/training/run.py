@@ -209,13 +209,15 @@ class Run:
     def _shares(self) -> jax.Array:
         """Fractions of the budget that are used before and after the next chunk.
 
-        They are extrapolated from the chunks so far, and thus known from the state alone: a run
-        that was stopped continues with the same schedule.
+        Of steps it is known; episodes and minutes are extrapolated from the chunks so far. So the
+        state alone tells: a run that was stopped continues with the same schedule.
         """
-        before = self.progress
-        chunks_done = int(self.state.updates) / self.config.chunk_updates
+        config, before = self.config, self.progress
+        chunks_done = int(self.state.updates) / config.chunk_updates
         pace = before / chunks_done if chunks_done else 0.0
-        return jnp.array([before, min(1.0, before + pace)], jnp.float32)
+        steps = self.steps + config.chunk_updates * config.steps_per_update
+        after = max(config.spent(steps, 0, 0.0), before + pace)
+        return jnp.array([before, min(1.0, after)], jnp.float32)
 
     def _record(
         self, state: TrainState, metrics: dict[str, np.ndarray], before: float, took: float

@@ -23,6 +23,8 @@ from tdanet_jax.io.untrusted import jsons, npz
 from tdanet_jax.splits import split_name
 from tdanet_jax.targets import known_classes
 
+#: Settings of the network that can be "auto".
+AUTO = ("precision", "image")
 #: Where the evaluated histories of a sweep's runs are kept.
 HISTORIES = "histories"
 
@@ -64,12 +66,26 @@ def plan(
     return out
 
 
+def settled(folder: Path | str, config: TrainConfig) -> TrainConfig:
+    """The run with every "auto" replaced: by what the run in its folder has, or else suits here.
+
+    So a sweep goes on with the same command on another kind of machine.
+    """
+    from tdanet_jax.task import resolve
+
+    if (Path(folder) / CONFIG_FILE).exists():
+        begun = configs.load(Path(folder) / CONFIG_FILE).network
+        auto = {n: getattr(begun, n) for n in AUTO if getattr(config.network, n) == "auto"}
+        config = dataclasses.replace(config, network=dataclasses.replace(config.network, **auto))
+    return resolve(config)
+
+
 def progress(folder: Path | str, config: TrainConfig) -> Literal["new", "begun", "finished"]:
     """How far the run of a configuration is.
 
     Args:
       folder: the run's.
-      config: the run, with every "auto" resolved (`task.resolve`).
+      config: the run, `settled`.
 
     Raises:
       ValueError: the folder holds a run of another configuration; the message names the flags.

@@ -16,8 +16,8 @@ from tdanet_jax.splits import NAMED
 from tdanet_jax.workflows.sweep import FinishedRun, evaluated_history, labels
 
 REPORT_VERSION = 1
-#: The splits of the paper's tables.
-PAPER_SPLITS = ("18/4", "14/8")
+#: The paper's comparisons of models: split -> table.
+PAPER_TABLES = {"22/0": "Table I", "18/4": "Table III", "14/8": "Table III"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +134,7 @@ def left_out(report: Report) -> list[str]:
     lines = []
     if report.unfinished:
         lines.append(f"Not finished: {', '.join(report.unfinished)}.")
-    for split in PAPER_SPLITS:
+    for split in PAPER_TABLES:
         trained = {run.config.model for run in report.runs if run.results["split"] == split}
         absent = [model for model in MODELS if model not in trained]
         if len(absent) == len(MODELS):
@@ -196,8 +196,8 @@ def _comparison(report: Report, split: str) -> Iterator[str]:
     ]
     theirs = paper.rates(split, next(iter(results.values()))[0].get("targets"))
     rows += [((f"{agent} (paper)", "", ""), groups) for agent, groups in theirs.items()]
-    tables = " (the paper's Tables I to III)" if split in PAPER_SPLITS else ""
-    yield from ("", f"## Split {split}: comparison of models{tables}", "")
+    table = f" (the paper's {PAPER_TABLES[split]})" if split in PAPER_TABLES else ""
+    yield from ("", f"## Split {split}: comparison of models{table}", "")
     yield from comparison.table(("Model", "Seeds", "Training episodes"), rows)
     if theirs:
         worlds = dict.fromkeys(

@@ -196,10 +196,10 @@ def _learn(
 ) -> bool:
     """Trains and saves; returns False if a process has stopped it before the budget's end."""
 
-    def save() -> float:
+    def save() -> list[float]:
         for run in runs:
             run.save()
-        return runs[0].seconds
+        return [run.seconds for run in runs]
 
     def stops() -> bool:
         if stopped := _waits_or_stops(runs, callbacks):
@@ -211,20 +211,24 @@ def _learn(
     pools = runs[0].pools
     if pools.unreached:
         callbacks.on_note(
-            f"note: pools of rooms that the budget ends before: {pools.unreached} of {pools.count};"
-            " with a lower --pool-updates turns are shorter"
+            f"note: the budget ends before the turn of {pools.unreached} of {pools.count} pools of "
+            "rooms; with a lower --pool-updates turns are shorter"
         )
     callbacks.on_note("compiling ...")
     with callbacks.shield(), contextlib.closing(pools):
         if stops():
             return False
+        before = [run.steps for run in runs]
         for rows in chunks:
-            callbacks.on_rows(runs, rows)
+            trained = [run for run, steps in zip(runs, before, strict=True) if run.steps > steps]
+            before = [run.steps for run in runs]
+            callbacks.on_rows(trained, rows)
             for sink in sinks:
                 sink(rows[0])
             if stops():
                 return False
-            if runs[0].seconds - saved > 60 * runs[0].config.checkpoint_minutes:
+            unsaved = max(run.seconds - at for run, at in zip(runs, saved, strict=True))
+            if unsaved > 60 * runs[0].config.checkpoint_minutes:
                 saved = save()
         save()
     return True

@@ -421,6 +421,8 @@ def test_a_model_that_sees_an_image_can_be_looked_into_but_not_asked(some_rooms,
     assert agent.weights["actor"]["kernel"].shape == (16, 6)
     with pytest.raises(ValueError, match="baseline needs an image; an agent is shown det"):
         agent.act(agent.start(), [Detection("sink", 0.1, 0.1, 0.3, 0.4)], "mug")
+    with pytest.raises(ValueError, match="baseline needs an image"):
+        Navigator(agent)
 
 
 def test_attention_sums_to_one_over_the_detections_and_none_is_fine(agent):

@@ -111,6 +111,12 @@ def test_every_type_is_recognised(name, real):
     assert detectors.read(make(real, empty=True), **told) == []
 
 
+def test_the_classes_of_supervision_may_be_a_list():
+    given = supervision(real=False)
+    given.data["class_name"] = given.data["class_name"].tolist()
+    assert_same(detectors.read(given, image_size=SIZE))
+
+
 @pytest.mark.parametrize("version", ["humble", "galactic", "foxy", "noetic"])
 def test_every_version_of_the_messages_of_ros(version):
     info = Fields(width=640, height=480, k=[0.0] * 9)

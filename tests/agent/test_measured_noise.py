@@ -220,6 +220,7 @@ def test_images_that_ids_and_files_name_differently_are_refused(tmp_path: Path) 
         (TRUTH, [{**FOUND[0], "score": 2}], "found.json: 0, score is not finite or above 1"),
         ({**TRUTH, "images": [{"id": 7, "width": 0, "height": 5}]}, FOUND, "must be positive"),
         ({**TRUTH, "categories": [{"id": []}]}, FOUND, "categories, 0, id: not a number"),
+        ({**TRUTH, "categories": [{"id": 1}]}, FOUND, "categories, 0, name: not a string"),
     ],
 )
 def test_an_odd_file_is_one_line_that_names_the_entry(
@@ -240,3 +241,6 @@ def test_the_command_prints_levels_that_noise_takes(
         "positives",
         "--noise misses=0.5,jitter=0.025,scores=0.661",  # 0.25 / (1 - 2 / 3 (1 - e^-2 / 2)),
     ]
+    truth, found = written(tmp_path, TRUTH, [{**one, "category_id": 5} for one in FOUND])
+    command.main(["--truth", str(truth), "--found", str(found)])
+    assert f"{truth} and {found} number categories alike?" in capsys.readouterr().err

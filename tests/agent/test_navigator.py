@@ -37,6 +37,9 @@ class Scripted:
         self.starts.append((rotation, horizon, measured))
         return "a state"
 
+    def check_input(self):
+        pass
+
     def key(self, seed, step):
         return seed, step
 

@@ -166,6 +166,9 @@ def test_a_navigator_runs_it(folder):
     assert not ours.knows("zwiebacky")
     assert ours.add_words({"zwiebacky": np.ones(50)}) == 1
     state, _ = ours.act(ours.start(), seen, "zwiebacky")
+    more = {"zwiebacky": np.ones(50)}
+    named = numpy_agent.load(folder, synonyms={"zwiebacky": ["zz"]}, more_words=more)
+    assert named.knows("zz")
     with pytest.raises(ValueError, match="say whether its MoveAhead was `blocked`"):
         ours.act(state._replace(action=0), seen, "mug")
 

@@ -19,12 +19,12 @@ from tests.support.pages import ROOT
 class Node:
     """Records what is published, and calls who subscribes."""
 
-    parameters = {"names": ["mug", "tv"], "forbid": ["LookUp"]}  # noqa: RUF012
+    parameters = {"names": ["mug", "tv"], "forbid": ["LookUp"], "horizon": 0}  # noqa: RUF012
 
     def __init__(self, name):
         self.subscribers, self.published, self.log, self.time = {}, [], [], 0
 
-    def declare_parameter(self, name, default):
+    def declare_parameter(self, name, default, descriptor=None):
         return Fields(value=self.parameters.get(name, default))
 
     def create_publisher(self, kind, topic, qos):
@@ -46,6 +46,9 @@ def node(monkeypatch, glove):
     """The node, whose agent does some actions; `tell` sends it a message."""
     modules = {
         "rclpy": {},
+        "rcl_interfaces.msg": {"ParameterDescriptor": Fields},
+        "rclpy.exceptions": {"ParameterException": RuntimeError},
+        "rclpy.executors": {"ExternalShutdownException": KeyError},
         "rclpy.node": {"Node": Node},
         "rclpy.qos": {"qos_profile_sensor_data": None},
         "rclpy.time": {"Time": Fields(from_msg=lambda stamp: stamp)},

@@ -255,12 +255,17 @@ def test_failures_are_sorted_and_some_can_be_looked_at(
     assert 0 < len(failed) < 8
     out = tmp_path / "why"
     words = ["--checkpoint", str(opinionated_run), "--data", str(rooms_file), "--out", str(out)]
-    failures.main([*words, "--replays", "2"])
+    failures.main([*words, "--replays", "3"])
+    (out / "episode-99999.html").write_text("my own")
+    capsys.readouterr()
+    failures.main([*words, "--replays", "2"])  # the old pages go, and no others
     said = " ".join(capsys.readouterr().out.split())
     assert f"my-run, split 18/4 episodes 8 seen failed {len(failed)} seen Done with" in said
     assert said.endswith(f"wrote {out}/failures.md, .json and .png and 2 replays")
     written = json.loads((out / "failures.json").read_text())
     assert [failure["episode"] for failure in written["failures"]] == failed
+    assert (out / "episode-99999.html").read_text() == "my own"
+    (out / "episode-99999.html").unlink()
     pages = sorted(out.glob("*.html"))
     assert len(pages) == 2
     for page in pages:

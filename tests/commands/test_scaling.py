@@ -20,6 +20,15 @@ def test_few_rooms_hold_all_types(ithor, glove):
     assert len(more.row_class) == len(params.row_class) + 9
 
 
+def test_the_sizes_that_are_measured_by_default_are_possible(ithor, glove):
+    task = make_task(TrainConfig(), ithor, glove)
+    scaling.measure(scaling.Command(), task)
+    for size in ("classes", "detections"):
+        least = min(getattr(scaling.Command(), size))
+        with pytest.raises(ValueError, match=f"--{size} 9: the rooms need at least"):
+            scaling.measure(scaling.Command(**{size: (9, least)}), task)
+
+
 @pytest.mark.slow
 def test_it_writes_figures_and_a_plot(tmp_path, monkeypatch, ithor):
     def cost(model, words, params, count, repeats):

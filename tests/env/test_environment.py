@@ -88,6 +88,11 @@ def test_the_name_gives_the_split_and_the_configuration_the_rest(rooms_file: Pat
     assert params.spec.rows == "class"
     obs, _ = env.reset(jax.random.key(0))
     assert list(obs.sensors) == ["odometry"]
+    env, _ = make(config=config)  # without a name, the configuration has the split, too
+    assert env.name == "ithor-14/8"
+    hidden = [name for i, name in enumerate(env.class_names) if not np.asarray(env.words[i]).any()]
+    assert {"Apple", "Television"} & {*env.class_names} <= {*hidden}
+    assert "Television" in hidden or "Apple" in hidden
 
 
 @pytest.mark.parametrize(

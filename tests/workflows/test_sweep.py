@@ -10,6 +10,7 @@ import pytest
 from tdanet_jax import config as configs
 from tdanet_jax.config import LearnerConfig, TrainConfig
 from tdanet_jax.evaluation import saved_networks
+from tdanet_jax.task import resolve
 from tdanet_jax.training import history
 from tdanet_jax.training.history import Snapshot
 from tdanet_jax.workflows import sweep
@@ -76,6 +77,22 @@ def test_a_run_is_new_begun_or_finished(tmp_path):
     assert sweep.progress(made(tmp_path, BASE), BASE) == "begun"
     done = dataclasses.replace(BASE, seed=1)
     assert sweep.progress(made(tmp_path, done, result(1)), done) == "finished"
+
+
+@pytest.mark.parametrize("began", ["float32", "bfloat16"])
+def test_a_sweep_goes_on_where_other_products_are_faster(began, tmp_path):
+    """What "auto" meant where a run began holds for that run, and not for those to come."""
+    network = dataclasses.replace(BASE.network, precision=began, image="raster")
+    there = dataclasses.replace(BASE, network=network)
+    folder = made(tmp_path, there, result())
+    assert BASE.network.precision == "auto"
+    assert sweep.settled(folder, BASE) == there
+    assert sweep.progress(folder, sweep.settled(folder, BASE)) == "finished"
+    assert sweep.settled(tmp_path / "new", BASE) == resolve(BASE)
+    (other,) = {"float32", "bfloat16"} - {began}
+    asked = dataclasses.replace(network, precision=other)
+    with pytest.raises(ValueError, match="other values of --precision"):
+        sweep.progress(folder, sweep.settled(folder, dataclasses.replace(BASE, network=asked)))
 
 
 def test_a_run_of_other_flags_is_not_touched(tmp_path):

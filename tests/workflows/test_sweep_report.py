@@ -134,7 +134,7 @@ def test_a_split_of_ones_own_stands_behind_those_of_the_paper(report, tmp_path):
     both = dataclasses.replace(report, runs=[run, *report.runs])
     assert both.splits == ["18/4", "Mug,Vase"]
     page = sweep_report.markdown(both, {})
-    assert "## Split 18/4: comparison of models (the paper's Tables I to III)" in page
+    assert "## Split 18/4: comparison of models (the paper's Table III)" in page
     assert "## Split Mug,Vase: comparison of models\n" in page
     assert "| Mug-Vase-tdanet-seed0 | 0 |" in page
 

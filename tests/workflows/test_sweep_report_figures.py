@@ -65,7 +65,7 @@ def test_the_page_line_by_line(report: Report, monkeypatch: pytest.MonkeyPatch) 
         "# 4 runs",
         "SR and SPL in percent, test rooms, sampled actions; mean ± standard deviation over the "
         "seeds of a configuration. Code abc.",
-        "## Split 18/4: comparison of models (the paper's Tables I to III)",
+        "## Split 18/4: comparison of models (the paper's Table III)",
         f"| Model | Seeds | Training episodes | {COLUMNS} |",
         rule(3),
         f"| random (ours) | 1 | 3,008 | {numbers(3.0)} |",
@@ -81,7 +81,7 @@ def test_the_page_line_by_line(report: Report, monkeypatch: pytest.MonkeyPatch) 
         f"| Room | Model | {COLUMNS} |",
         rule(2),
         *(labelled[room] for room in ("kitchen", "bedroom") for labelled in rooms),
-        "## Split 14/8: comparison of models (the paper's Tables I to III)",
+        "## Split 14/8: comparison of models (the paper's Table III)",
         f"| Model | Seeds | Training episodes | {COLUMNS} |",
         rule(3),
         f"| tdanet (ours) | 1 | 3,007 | {numbers(33.0)} |",
