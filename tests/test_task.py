@@ -244,9 +244,10 @@ def test_training_with_wrong_detections_is_refused_to_a_model_of_images(
         make_task(config, some_rooms, glove)
 
 
-@pytest.mark.parametrize("model", ["tdanet", "ssnet", "baseline"])
-def test_size_noise_changes_nothing_for_a_model_of_images(model: str) -> None:
-    network = NetworkConfig(image="raster") if model == "baseline" else NetworkConfig()
+@pytest.mark.parametrize("model", ["tdanet", "ssnet", "mjolnir-r", "baseline"])
+def test_size_noise_changes_nothing_for_a_model_without_boxes(model: str) -> None:
+    images = model in ("mjolnir-r", "baseline")
+    network = NetworkConfig(image="raster") if images else NetworkConfig()
     for noise in (0.0, 0.5):
         config = TrainConfig(model=model, network=network, learner=LearnerConfig(size_noise=noise))
         idle = ["--size-noise"] if noise and model == "baseline" else []

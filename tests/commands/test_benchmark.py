@@ -30,11 +30,11 @@ def test_a_second_start_finds_what_the_first_has_compiled(ithor, tmp_path):
 def test_a_wrong_folder_ends_before_anything_is_measured(tmp_path, capsys):
     out = tmp_path / "figures.jsonl"
     for flags in (
-        ["--checkpoint", "nowhere", "--out", str(out)],
-        ["--out", "nowhere/figures.jsonl"],
+        ["--parts", "machine", "agent", "--checkpoint", "nowhere", "--out", str(out)],
+        ["--parts", "machine", "--out", "nowhere/figures.jsonl"],
     ):
         with pytest.raises(SystemExit) as ended:
-            benchmark.main(["--parts", "machine", *flags])
+            benchmark.main(flags)
         assert ended.value.code == 2
         said = capsys.readouterr()
         assert "nowhere" in said.err

@@ -391,7 +391,10 @@ ROWS: dict[str, tuple[str, dict[str, str | tuple[str, str]]]] = {
             "--words": "--words words.txt",
             "--synonyms": "--synonyms mine.json",
             "--reach-threshold": "--reach-threshold 0.5",
-            "--temperature": "--temperature 0.5",
+            "--temperature": (
+                "--checkpoint run --seed 5",
+                "--checkpoint run --seed 5 --temperature 0.5",
+            ),
             "--done-bias": "--done-bias 1",
         },
     ),

@@ -206,6 +206,13 @@ def test_a_run_that_is_no_longer_finite_stops_with_its_state_saved(task, tmp_pat
     assert not (tmp_path / "history").exists()  # none was asked for
 
 
+def test_the_learning_rate_falls_linearly_from_the_first_update_on(whole):
+    """A row has the mean of its two updates, at 0 and 1, 2 and 3, ... of 16 in all."""
+    shares = (np.arange(0, 16, 2) + 0.5) / 16
+    rates = [row["learning_rate"] for row in whole[2]]
+    np.testing.assert_allclose(rates, TINY.learner.learning_rate * (1 - shares), rtol=1e-5)
+
+
 def test_a_chunk_in_which_no_episode_ended_has_no_success(whole, tmp_path):
     metrics = collections.defaultdict(lambda: np.zeros(2)) | {"actions": np.zeros((2, 6), int)}
     row = whole[1]._row(metrics, took=1.0)

@@ -108,6 +108,7 @@ def test_what_was_not_trained_is_left_out_and_named(report):
     lines = sweep_report.left_out(report)
     rest = [model for model in MODELS if model not in ("tdanet", "tdanet-no-ta")]
     assert lines == [
+        "Split 22/0: nothing was trained.",
         f"Split 18/4: not trained: {', '.join(rest)}.",
         "Split 14/8: nothing was trained.",
         "Learning curve: no history of 18-4-tdanet-no-ta-seed0.",

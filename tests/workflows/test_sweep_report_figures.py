@@ -111,6 +111,7 @@ def test_the_page_line_by_line(report: Report, monkeypatch: pytest.MonkeyPatch) 
         f"| run2 | 2 | 3,002 | 5,002 | - | {numbers(25.0)} |",
         f"| run7 | 7 | 3,007 | 5,007 | 5.5 | {numbers(33.0)} |",
         "## Left out",
+        "- Split 22/0: nothing was trained.",
         f"- Split 18/4: not trained: {', '.join(others)}.",
         f"- Split 14/8: not trained: {', '.join(['tdanet-no-ta', *others])}.",
         "- Learning curve: no history of run0, run1, run2, run7.",
