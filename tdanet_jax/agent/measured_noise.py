@@ -17,6 +17,11 @@ from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.sense_noise import SMALL_SIDE, SenseNoise, highest
 
 _SIZE = ("width", "height")
+#: What is likely to be wrong if categories do not fit.
+NUMBERS = (
+    "do both files number categories alike? ultralytics writes the model's numbers, from 1 (older "
+    "versions from 0)"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,8 +229,10 @@ def _add(
 ) -> None:
     """Appends an entry's box to the list of its image; boxes outside of it are left out."""
     image, category = (_key(path, at, entry, name) for name in ("image_id", "category_id"))
-    if image not in sizes or category not in names:
-        raise FileError(path, f"{at}: image {image} or category {category} is not in the labels")
+    if image not in sizes:
+        raise FileError(path, f"{at}: image {image} is not in the labels")
+    if category not in names:
+        raise FileError(path, f"{at}: category {category} is not in the labels; {NUMBERS}")
     box = entry.get("bbox")
     if not isinstance(box, list) or len(box) != 4:
         raise FileError(path, f"{at}, bbox: not four numbers")

@@ -49,13 +49,16 @@ class SimulatedRobot:
             sees more than the rooms' 90 degrees.
         """
         camera = camera or Camera(FIELD_OF_VIEW, FIELD_OF_VIEW)
-        if camera.horizon or max(camera.hfov, camera.vfov or 0) > FIELD_OF_VIEW:
+        view = np.tan(np.radians([camera.hfov / 2, (camera.vfov or 0) / 2]))
+        centre = np.array(camera.centre)
+        widest = 2 * view * np.maximum(centre, 1 - centre)  # tangents, to the farther side
+        if camera.horizon or widest.max() > math.tan(math.radians(FIELD_OF_VIEW / 2)) + 1e-9:
             raise ValueError("simulated robot: its camera must be level and see 90 degrees at most")
         rooms = dataset.load_rooms(None).tables if tables is None else tables
         self._tables = rooms.subset([scene])
         self._labels = Labels(self._tables.classes)
-        view = np.tan(np.radians([camera.hfov / 2, (camera.vfov or 0) / 2]))
-        self._view = np.tile(view, 2)  # tangents of the image's sides, x1, y1, x2, y2
+        # Half the image's sides at a depth of 1, and its optical axis, for x1, y1, x2, y2.
+        self._view, self._centre = np.tile(view, 2), np.tile(centre, 2)
         grid, rng = self._tables.grid, np.random.default_rng(seed)
         along = math.lcm(grid.turn, 90) // grid.turn  # turns from one axis to the next
         place = rng.integers(len(self._tables.position))
@@ -66,7 +69,7 @@ class SimulatedRobot:
     def detect(self) -> list[Detection]:
         """The objects in the image of its camera."""
         view = camera_view.of_pose(self._tables, self.state)
-        boxes = 0.5 + (view.boxes - 0.5) / self._view
+        boxes = self._centre + (view.boxes - 0.5) / self._view
         return detectors.in_image((*one, None) for one in zip(view.classes, boxes, strict=True))
 
     def do(self, action: str) -> None:

@@ -122,6 +122,7 @@ class Command:
 
     def check_parts(self) -> None:
         """Raises ValueError if a flag is given that none of the `parts` heeds."""
+        timed = ("machine", "environment", *TRAINED, "evaluation", "decision")
         quality = ("preset", "num_envs", "units", "seeds", "most_steps")
         for names, parts in (
             (("odometry", "triangulation", "models"), (*TRAINED, "decision")),
@@ -130,12 +131,14 @@ class Command:
             (("networks",), ("evaluation",)),
             (("checkpoint",), ("evaluation", "agent")),
             (quality, ("quality",)),
+            (("repeats",), timed),
+            (("data",), ("import", *timed[1:], "quality")),
         ):
             for name in names:
                 given = getattr(self, name) != getattr(Command, name)
                 if given and not {*parts} & {*self.parts}:
                     flag, known = name.replace("_", "-"), ", ".join(parts)
-                    raise ValueError(f"--{flag}: needs one of these among --parts: {known}")
+                    raise ValueError(f"--{flag}: is for --parts {known}")
 
 
 def main(arguments: list[str] | None = None) -> None:

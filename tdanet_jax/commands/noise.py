@@ -35,9 +35,10 @@ def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     with one_line_errors():
         command = parse(Command, arguments, prog="tdanet noise", description=__doc__)
-        for name, value in (("min-score", command.min_score), ("iou", command.iou)):
-            if not 0 <= value <= 1:
-                fail(f"--{name} {value}: must be from 0 to 1")
+        if not 0 <= command.min_score <= 1:
+            fail(f"--min-score {command.min_score}: must be from 0 to 1")
+        if not 0 < command.iou < 1:
+            fail(f"--iou {command.iou}: must be between 0 and 1")
         from tdanet_jax.agent import measured_noise
 
         there, seen = measured_noise.read_coco(command.truth, command.found, command.min_score)
@@ -49,8 +50,4 @@ def main(arguments: list[str] | None = None) -> None:
         )
         console.print(f"--noise {found.noise}")
         if found.mislabelled > found.found / 2:
-            warnings.warn(
-                f"most labels are wrong: do {command.truth} and {command.found} number categories "
-                "alike? ultralytics writes the model's numbers, from 1 (older versions from 0)",
-                stacklevel=1,
-            )
+            warnings.warn(f"most labels are wrong: {measured_noise.NUMBERS}", stacklevel=1)

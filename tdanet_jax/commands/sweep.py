@@ -151,7 +151,7 @@ def share(command: Command, configs: Sequence[TrainConfig]) -> list[TrainConfig]
 def alike(command: Command) -> Callable[[TrainConfig], Any]:
     """The key of runs that are trained in one call, which follow one another."""
     if command.vmap_seeds:
-        return lambda config: (config.split, config.model, config.network.precision)
+        return lambda config: (config.split, config.model, config.network)
     return lambda config: config
 
 
@@ -202,6 +202,9 @@ def run(
     typed: str,
 ) -> None:
     """Trains and reports; says how to continue if a signal stops it."""
+    from tdanet_jax.evaluation import report
+
+    report.code_version()  # as it is now
     try:
         left = [] if command.report_only else train_all(command, training, configs, typed)
         if command.shard is None:
@@ -248,7 +251,7 @@ def train_all(
     # A clash, or a model that cannot be made, shows before anything trains.
     for asked in configs:
         folder = command.out / run_name(asked)
-        config = sweep.settled(folder, asked)
+        config = sweep.settled(command.out, asked)
         make_model(config, ClassVocabulary())
         devices.check_divides(config.learner.num_envs, mesh)
         if sweep.progress(folder, config) != "finished":

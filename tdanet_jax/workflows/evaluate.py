@@ -63,6 +63,7 @@ def evaluate(
       ValueError: a folder holds no run, its network cannot be read, or the arguments do not go
         together.
     """
+    report.code_version()  # as it is now
     folder = None if out is None else Path(out)
     if folder is not None:
         files.check_writable(folder)

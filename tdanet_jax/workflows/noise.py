@@ -70,6 +70,7 @@ def evaluate_noise(
         same agents, episodes, rooms and seed.
       BlockingIOError: another process writes to the folder.
     """
+    report.code_version()  # as it is now
     test.check(policy, seed)
     folder = None if out is None else Path(out)
     with contextlib.nullcontext() if folder is None else files.locked(folder):

@@ -11,7 +11,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, TrainConfig
@@ -66,17 +66,24 @@ def plan(
     return out
 
 
-def settled(folder: Path | str, config: TrainConfig) -> TrainConfig:
-    """The run with every "auto" replaced: by what the run in its folder has, or else suits here.
+def settled(out: Path | str, config: TrainConfig) -> TrainConfig:
+    """A run of the sweep in `out` with every "auto" replaced by what suits this machine.
 
-    So a sweep goes on with the same command on another kind of machine.
+    If it has begun, or another seed of it, by what that has: so a sweep goes on with the same
+    command on another kind of machine, and its seeds stay alike.
     """
     from tdanet_jax.task import resolve
 
-    if (Path(folder) / CONFIG_FILE).exists():
-        begun = configs.load(Path(folder) / CONFIG_FILE).network
-        auto = {n: getattr(begun, n) for n in AUTO if getattr(config.network, n) == "auto"}
-        config = dataclasses.replace(config, network=dataclasses.replace(config.network, **auto))
+    own = Path(out) / configs.run_name(config)
+    for folder in (own, *sorted(path.parent for path in Path(out).glob(f"*/{CONFIG_FILE}"))):
+        if not (folder / CONFIG_FILE).exists():
+            continue
+        begun = configs.load(folder / CONFIG_FILE)
+        if configs.run_name(dataclasses.replace(begun, seed=config.seed)) == own.name:
+            names = (name for name in AUTO if getattr(config.network, name) == "auto")
+            auto: dict[str, Any] = {name: getattr(begun.network, name) for name in names}
+            network = dataclasses.replace(config.network, **auto)
+            return resolve(dataclasses.replace(config, network=network))
     return resolve(config)
 
 

@@ -215,7 +215,8 @@ def test_images_that_ids_and_files_name_differently_are_refused(tmp_path: Path) 
     [
         ({**TRUTH, "images": 3}, FOUND, r"truth.json: images: not a list of objects"),
         (TRUTH, {"a": 1}, r"found.json: not a list of objects"),
-        (TRUTH, [{**FOUND[0], "image_id": 9}], "found.json: 0: image 9 or category 1 is not in"),
+        (TRUTH, [{**FOUND[0], "image_id": 9}], "found.json: 0: image 9 is not in the labels"),
+        (TRUTH, [{**FOUND[0], "category_id": 0}], "category 0 is not in the labels; do both files"),
         (TRUTH, [FOUND[0], {**FOUND[0], "bbox": [1, 2]}], "found.json: 1, bbox: not four numbers"),
         (TRUTH, [{**FOUND[0], "score": 2}], "found.json: 0, score is not finite or above 1"),
         ({**TRUTH, "images": [{"id": 7, "width": 0, "height": 5}]}, FOUND, "must be positive"),
@@ -243,4 +244,4 @@ def test_the_command_prints_levels_that_noise_takes(
     ]
     truth, found = written(tmp_path, TRUTH, [{**one, "category_id": 5} for one in FOUND])
     command.main(["--truth", str(truth), "--found", str(found)])
-    assert f"{truth} and {found} number categories alike?" in capsys.readouterr().err
+    assert "most labels are wrong: do both files number categories" in capsys.readouterr().err

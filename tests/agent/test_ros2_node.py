@@ -136,3 +136,25 @@ def test_a_new_target_waits_for_the_action_under_way(node):
     assert node.log[-1] == "tv: done"
     node.tell("target", data="mug")  # no driver need answer Done
     assert node.since == 4
+
+
+def test_a_wrong_action_is_named_when_the_node_starts(node, monkeypatch):
+    monkeypatch.setattr(Node, "parameters", Node.parameters | {"forbid": ["Jump"]})
+    with pytest.raises(ValueError, match="--forbid Jump: choose among"):
+        sys.modules["ros2_node"].NavigatorNode()
+
+
+def test_it_ends_without_a_traceback(node, monkeypatch):
+    module = sys.modules["ros2_node"]
+
+    def end_with(error):
+        def spin(_):
+            raise error
+
+        monkeypatch.setattr(module, "rclpy", Fields(init=lambda: None, spin=spin))
+        module.main()
+
+    end_with(KeyboardInterrupt())
+    end_with(module.ExternalShutdownException())
+    with pytest.raises(SystemExit, match="error: no number"):
+        end_with(module.ParameterException("no number"))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tdanet_jax.agent.camera import Camera
+from tdanet_jax.agent.detection import Detection
 from tdanet_jax.agent.simulated import SimulatedRobot
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.params import TEST_STEP_LIMITS, make_params
@@ -63,12 +64,26 @@ def test_it_sees_what_the_tables_say_through_its_camera(room):
     assert {(d.label, *np.round([d.x1, d.y1], 6)) for d in shown} <= clipped
 
 
+def test_the_axis_of_its_camera_need_not_meet_the_middle(room):
+    """What it shows is mapped back to where the rooms' camera sees it."""
+    camera = Camera(60, 60, centre=(0.4, 0.55))
+    shown = camera.to_agent(SimulatedRobot(SCENE, camera, 7, room).detect())
+    (whole,) = camera.to_agent([Detection("", 0, 0, 1, 1)])
+    seen = detections_of(room, SimulatedRobot(SCENE, None, 7, room).state)
+    inside = {(d.label, *np.round([max(d.x1, whole.x1), max(d.y1, whole.y1)], 6)) for d in seen}
+    assert len(shown) > 2
+    assert {(d.label, *np.round([d.x1, d.y1], 6)) for d in shown} <= inside
+
+
 def test_it_begins_level_and_along_an_axis(room):
     begun = {room.grid.split(SimulatedRobot(SCENE, None, s, room).state)[1:] for s in range(20)}
     assert begun == {(rotation, room.grid.level) for rotation in (0, 2, 4, 6)}
 
 
-@pytest.mark.parametrize("camera", [Camera(69, 55, horizon=5), Camera(91, 55), Camera(50, 100)])
+@pytest.mark.parametrize(
+    "camera",
+    [Camera(69, 55, horizon=5), Camera(91, 55), Camera(50, 100), Camera(85, 60, centre=(0.6, 0.5))],
+)
 def test_a_camera_that_the_rooms_cannot_give_is_refused(room, camera):
     with pytest.raises(ValueError, match="simulated robot: its camera must be level and see 90"):
         SimulatedRobot(SCENE, camera, tables=room)

@@ -137,6 +137,7 @@ def test_spaces_hold_what_is_observed(config: TrainConfig) -> None:
     assert not space.contains(obs.replace(target=jnp.int32(len(env.class_names))))
     drawn = space.sample(jax.random.key(1))
     assert space.contains(drawn)
+    assert {*np.asarray(drawn["mask"]).tolist()} == {True, False}
     assert {name: part.shape for name, part in drawn.items()} == {
         name: getattr(obs, name).shape for name in drawn
     }

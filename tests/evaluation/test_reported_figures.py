@@ -325,3 +325,7 @@ def test_a_curve_has_each_figure_at_its_own_point() -> None:
         if key is not None:
             means = [spread.mean for spread in found.values[key] if spread is not None]
             assert means == [22.0 + 1.5 * i, 32.0 + 1.5 * i]
+
+
+def test_the_code_is_that_of_the_first_call() -> None:
+    assert report.code_version() is report.code_version()

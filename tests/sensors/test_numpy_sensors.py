@@ -99,10 +99,11 @@ def test_an_agent_whose_measured_pose_wavers_has_not_moved(spec):
     theirs = suite.init(spec, Start(jnp.int32(0), jnp.int32(0), NO_SLIP))
     ours, said = numpy_sensors.init(spec, 0, 0, True), []
     for number in range(7):
-        turned = 45 * (number > 0) * (-1) ** number  # to and fro, the target always in view
+        turned = 22.5 * (number > 0) * (-1) ** number  # to and fro, the target always in view
         action = (6, Action.ROTATE_LEFT, Action.ROTATE_RIGHT)[(number > 0) * (1 + number % 2)]
         pose = measured_pose(spec.grid, 0, *rng.normal(scale=0.002, size=2), turned)
-        boxes = np.array([[0.5 + rng.normal(scale=0.03), 0.5, 0.01]])
+        right = -np.tan(np.radians(turned)) / 2 + rng.normal(scale=0.03)
+        boxes = np.array([[0.5 + right, 0.5, 0.01]])
         frame = Frame(np.zeros(1, int), boxes, np.ones(1, bool), np.int32(0))
         motion = Motion(jnp.int32(action), jnp.array(False), measured=pose)
         theirs, features = step(spec, theirs, motion, jnp.array(False), frame)

@@ -288,7 +288,7 @@ def test_a_run_that_waits_for_rooms_says_so_and_can_be_stopped(
     assert len(watching.told) >= 2
     assert {*watching.told} <= {(0.0, 1), (3.0, 10), (4.0, 10)}
     assert watching.notes.count("waiting for the next pool of rooms ...") == 1
-    left_out = "note: pools of rooms that the budget ends before: 1 of 3;"
+    left_out = "note: the budget ends before the turn of 1 of 3 pools of rooms;"
     assert any(note.startswith(left_out) for note in watching.notes) == stop
     assert watching.stopped == stop
     assert len(read_metrics(tmp_path / "run")) == (2 if stop else 8)

@@ -81,18 +81,20 @@ def test_a_run_is_new_begun_or_finished(tmp_path):
 
 @pytest.mark.parametrize("began", ["float32", "bfloat16"])
 def test_a_sweep_goes_on_where_other_products_are_faster(began, tmp_path):
-    """What "auto" meant where a run began holds for that run, and not for those to come."""
+    """What "auto" meant where a run began holds for that run and its other seeds."""
     network = dataclasses.replace(BASE.network, precision=began, image="raster")
     there = dataclasses.replace(BASE, network=network)
     folder = made(tmp_path, there, result())
     assert BASE.network.precision == "auto"
-    assert sweep.settled(folder, BASE) == there
-    assert sweep.progress(folder, sweep.settled(folder, BASE)) == "finished"
-    assert sweep.settled(tmp_path / "new", BASE) == resolve(BASE)
+    assert sweep.settled(tmp_path, BASE) == there
+    assert sweep.progress(folder, sweep.settled(tmp_path, BASE)) == "finished"
+    second, other_model = (dataclasses.replace(BASE, **x) for x in ({"seed": 1}, {"model": "sp"}))
+    assert sweep.settled(tmp_path, second).network == network  # seeds are alike
+    assert sweep.settled(tmp_path, other_model) == resolve(other_model)
     (other,) = {"float32", "bfloat16"} - {began}
     asked = dataclasses.replace(network, precision=other)
     with pytest.raises(ValueError, match="other values of --precision"):
-        sweep.progress(folder, sweep.settled(folder, dataclasses.replace(BASE, network=asked)))
+        sweep.progress(folder, sweep.settled(tmp_path, dataclasses.replace(BASE, network=asked)))
 
 
 def test_a_run_of_other_flags_is_not_touched(tmp_path):
