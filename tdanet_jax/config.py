@@ -313,6 +313,11 @@ class TrainConfig:
         limits = {name: getattr(self, name) for name in BUDGETS}
         return {name: limit for name, limit in limits.items() if limit is not None}
 
+    @property
+    def limits(self) -> dict[str, Any]:
+        """The limits that hold, by name: those given, or else of steps."""
+        return self.budget or {"steps": DEFAULT_STEPS}
+
     def with_budget(self, other: TrainConfig) -> TrainConfig:
         """The same run with the budget of another."""
         return dataclasses.replace(self, **{name: getattr(other, name) for name in BUDGETS})
@@ -320,8 +325,7 @@ class TrainConfig:
     def spent(self, steps: int, episodes: int, seconds: float) -> float:
         """Fraction of the budget that has been used; training ends at 1."""
         done = {"steps": steps, "episodes": episodes, "minutes": seconds / 60}
-        limits = self.budget or {"steps": DEFAULT_STEPS}
-        return max(done[name] / limit for name, limit in limits.items())
+        return max(done[name] / limit for name, limit in self.limits.items())
 
     @property
     def steps_per_update(self) -> int:
@@ -488,9 +492,10 @@ ROBUST = dataclasses.replace(
 )
 #: What did best on validation with the inputs that the paper's agent has (docs/results.md).
 PAPER_INPUTS = TrainConfig(
+    steps=24_000_000,
     extra_targets="all",
     learner=LearnerConfig(gamma=0.97, imitation_weight=0.3),
-    network=NetworkConfig(temperature=0.7),
+    network=NetworkConfig(width=256, hidden=256, temperature=0.7),
 )
 PRESETS = {
     "default": TrainConfig(),

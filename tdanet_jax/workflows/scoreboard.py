@@ -113,8 +113,11 @@ def _differing(config: TrainConfig, preset: TrainConfig) -> list[str]:
     A limit of the preset that it has not is left out: another one takes its place. So are flags of
     pools, if there is only one.
     """
-    values, usual = comparison.flags(config), comparison.flags(preset)
-    absent = {f"--{name}" for name in BUDGETS if getattr(config, name) is None}
+    values, usual = (
+        comparison.flags(one) | {f"--{name}": one.limits.get(name) for name in BUDGETS}
+        for one in (config, preset)
+    )
+    absent = {f"--{name}" for name in BUDGETS if name not in config.limits}
     own = len(make_split("22/0", config.validation).train_scenes)
     if config.variants * own + config.generated <= config.pool_rooms:
         absent |= {*_POOLS}
