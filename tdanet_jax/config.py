@@ -75,7 +75,9 @@ class LearnerConfig:
     imitation_weight: float = 0.0
     """Initial weight of imitation in the loss: minus the logarithm of the probability, among all
     actions but Done, of the moves that begin a shortest path to the target, once it has been seen.
-    Falls linearly to 0 at half of the budget. Not in the paper (docs/method.md)."""
+    Falls linearly to 0. Not in the paper (docs/method.md)."""
+    imitation_until: float = 0.5
+    """Share of the budget at which the weight of imitation reaches 0."""
     step_limit: int = 50
     """Actions after which a training episode is truncated."""
     partial_reward: Literal["parents", "similarity", "none"] = "parents"
@@ -411,6 +413,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     (("generated",), lambda value: value <= MOST_GENERATED, f"be at most {MOST_GENERATED:,}"),
     (("size_noise",), lambda value: 0 <= value <= 2, "be between 0 and 2"),
     (("gamma", "gae_lambda"), lambda value: 0 <= value <= 1, "be between 0 and 1"),
+    (("imitation_until",), lambda value: 0 < value <= 1, "be above 0 and at most 1"),
     (("dropout",), lambda value: 0 <= value < 1, "be at least 0 and below 1"),
 )  # fmt: skip
 

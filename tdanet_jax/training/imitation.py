@@ -1,4 +1,4 @@
-"""Imitation of shortest paths, for the first half of a run.
+"""Imitation of shortest paths, for a part of a run or all of it.
 
 Left to its rewards, an agent turns one way only. To look for its target, either way will do; by the
 time that training has taught it to go back to a target that it has seen, it has given up one of
@@ -16,15 +16,19 @@ import numpy as np
 
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action
 
-#: Share of the budget after which nothing is imitated any more.
-END = 0.5
 #: All actions but `Done`, [6] bool.
 MOVES = np.arange(NUM_ACTIONS) != Action.DONE
 
 
-def weight(initial: float, progress: jax.Array) -> jax.Array:
-    """The weight of imitation in the loss: falls linearly from `initial` to 0 at `END`."""
-    return initial * jnp.clip(1.0 - progress / END, 0.0, 1.0)
+def weight(initial: float, until: float, progress: jax.Array) -> jax.Array:
+    """The weight of imitation in the loss: falls linearly from `initial` to 0.
+
+    Args:
+      initial: at the start.
+      until: share of the budget at which it is 0.
+      progress: share that is spent.
+    """
+    return initial * jnp.clip(1.0 - progress / until, 0.0, 1.0)
 
 
 def loss(logits: jax.Array, best_moves: jax.Array) -> jax.Array:

@@ -92,7 +92,9 @@ def schedule(config: LearnerConfig, progress: jax.Array) -> Scheduled:
     return Scheduled(
         learning_rate=mix(config.learning_rate, config.final_learning_rate),
         entropy_weight=mix(config.entropy_weight, config.final_entropy_weight),
-        imitation_weight=imitation.weight(config.imitation_weight, progress),
+        imitation_weight=imitation.weight(
+            config.imitation_weight, config.imitation_until, progress
+        ),
     )
 
 

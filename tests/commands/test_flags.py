@@ -639,6 +639,8 @@ SHOWN = {
     "pool_updates": "training/test_pools.py::test_turns_are_whole_chunks_and_one_pool_has_no_turns",
     "imitation_weight": "training/test_imitation.py::test_its_weight_falls_to_nothing_at_half_"
     "of_the_budget",
+    "imitation_until": "training/test_imitation.py::test_its_weight_reaches_nothing_at_the_share_"
+    "that_is_chosen",
     "minutes": "training/test_run_bookkeeping.py::test_time_and_rows_continue",
     "seed": "training/test_run.py::test_another_seed_gives_another_run",
     "validation": "test_splits.py::test_validation_touches_neither_test_rooms_nor_unseen_classes",

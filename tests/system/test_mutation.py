@@ -332,7 +332,7 @@ FAULTS = (
           "training=True),\n        target_seen=_unseen(config),\n    )\n\n\n@jax",
           "training=True),\n    )\n\n\n@jax", "training/test_pools.py"),
     Fault("Done is imitated", LEARNER, "& imitation.MOVES & seen", "& seen", "training/test_imitation.py"),
-    Fault("imitation for ever", "training/imitation.py", "progress / END, 0.0, 1.0", "0.0, 0.0, 1.0",
+    Fault("imitation for ever", "training/imitation.py", "progress / until, 0.0, 1.0", "0.0, 0.0, 1.0",
           "training/test_imitation.py"),
     Fault("any move will do", "env/dynamics.py", "there == here - 1", "there <= here",
           "training/test_imitation.py"),

@@ -130,6 +130,16 @@ def test_its_mean_enters_the_loss_with_its_weight() -> None:
     assert float(total - without) == pytest.approx(0.25 * each[counted].mean(), rel=1e-3)
 
 
+@pytest.mark.parametrize("until", [0.25, 0.5, 1.0])
+def test_its_weight_reaches_nothing_at_the_share_that_is_chosen(until: float) -> None:
+    config = dataclasses.replace(CONFIG, imitation_until=until)
+    weights = [
+        float(learner.schedule(config, jnp.float32(x * until)).imitation_weight)
+        for x in (0.0, 0.25, 0.5, 1.0, 1.5)
+    ]
+    assert weights == pytest.approx([0.4, 0.3, 0.2, 0.0, 0.0])
+
+
 @pytest.mark.parametrize(("spent", "share"), [(0.0, 1.0), (0.125, 0.75), (0.5, 0.0), (1.0, 0.0)])
 def test_its_weight_falls_to_nothing_at_half_of_the_budget(spent: float, share: float) -> None:
     state, progress = house.start(0, CONFIG), jnp.float32(spent)
