@@ -497,8 +497,8 @@ ROBUST = dataclasses.replace(
 PAPER_INPUTS = TrainConfig(
     steps=24_000_000,
     extra_targets="all",
-    learner=LearnerConfig(gamma=0.97, imitation_weight=0.3),
-    network=NetworkConfig(width=256, hidden=256, temperature=0.7),
+    learner=LearnerConfig(gamma=0.97, imitation_weight=0.3, imitation_until=1.0),
+    network=NetworkConfig(width=256, hidden=256, temperature=0.5),
 )
 PRESETS = {
     "default": TrainConfig(),
