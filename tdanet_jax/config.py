@@ -495,10 +495,9 @@ ROBUST = dataclasses.replace(
 )
 #: What did best on validation with the inputs that the paper's agent has (docs/results.md).
 PAPER_INPUTS = TrainConfig(
-    steps=24_000_000,
     extra_targets="all",
-    learner=LearnerConfig(gamma=0.97, imitation_weight=0.3, imitation_until=1.0),
-    network=NetworkConfig(width=256, hidden=256, temperature=0.5),
+    learner=LearnerConfig(gamma=0.97, imitation_weight=0.3),
+    network=NetworkConfig(width=256, hidden=256, temperature=0.7),
 )
 PRESETS = {
     "default": TrainConfig(),

@@ -146,7 +146,7 @@ def test_means_of_the_seeds_with_the_papers_inputs() -> None:
         return [f"{m} ± {statistics.stdev(v):.1f}" for m, v in zip(means, each, strict=True)]
 
     readme = (ROOT / "README.md").read_text()
-    assert f"256`, three seeds | {' | '.join(of_seeds('L>=1', spread=False))} |" in readme
+    assert f"paper-inputs`, three seeds | {' | '.join(of_seeds('L>=1', spread=False))} |" in readme
     told = " ".join(section("results", "The paper's inputs").split())
     sr, spl, unseen_sr, unseen_spl = of_seeds("L>=5", spread=True)
     assert f"L >= 5: seen SR {sr}, SPL {spl}; unseen SR {unseen_sr}, SPL {unseen_spl}." in told
