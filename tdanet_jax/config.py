@@ -220,9 +220,9 @@ class TrainConfig:
     """Requires --generated. Train in generated rooms alone. Parents of targets and the class graph
     are those of the training rooms in any case."""
     pool_rooms: int = 1500
-    """Variants and generated rooms of a pool, about: pools are made of whole files of 100 generated
-    rooms, or of a variant of each room. If there are more rooms, pools take turns: the first, the
-    present and the next one are in memory, and the next is built or loaded meanwhile."""
+    """About how many variants and generated rooms a pool has: it is made of whole files of 100
+    generated rooms, or of a variant of each room. If there are more rooms, pools take turns: the
+    first, the present and the next one are in memory, and the next is built or loaded meanwhile."""
     pool_updates: int = 800
     """Updates in a pool before the next one's turn, rounded to whole calls of --chunk-updates."""
     chunk_updates: int = 10

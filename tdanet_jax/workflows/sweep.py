@@ -69,21 +69,19 @@ def plan(
 def settled(out: Path | str, config: TrainConfig) -> TrainConfig:
     """A run of the sweep in `out` with every "auto" replaced by what suits this machine.
 
-    If it has begun, or another seed of it, by what that has: so a sweep goes on with the same
-    command on another kind of machine, and its seeds stay alike.
+    A run that has begun keeps the values that it began with, and its other seeds take the same
+    ones. So a sweep can be continued on another kind of machine.
     """
     from tdanet_jax.task import resolve
 
-    own = Path(out) / configs.run_name(config)
-    for folder in (own, *sorted(path.parent for path in Path(out).glob(f"*/{CONFIG_FILE}"))):
-        if not (folder / CONFIG_FILE).exists():
-            continue
-        begun = configs.load(folder / CONFIG_FILE)
-        if configs.run_name(dataclasses.replace(begun, seed=config.seed)) == own.name:
-            names = (name for name in AUTO if getattr(config.network, name) == "auto")
-            auto: dict[str, Any] = {name: getattr(begun.network, name) for name in names}
-            network = dataclasses.replace(config.network, **auto)
-            return resolve(dataclasses.replace(config, network=network))
+    own = Path(out) / configs.run_name(config) / CONFIG_FILE
+    seeds = f"{own.parent.name.rpartition('seed')[0]}seed*/{CONFIG_FILE}"
+    begun = own if own.exists() else min(Path(out).glob(seeds), default=None)
+    if begun is not None:
+        there = configs.load(begun).network
+        names = (name for name in AUTO if getattr(config.network, name) == "auto")
+        auto: dict[str, Any] = {name: getattr(there, name) for name in names}
+        config = dataclasses.replace(config, network=dataclasses.replace(config.network, **auto))
     return resolve(config)
 
 
