@@ -176,8 +176,12 @@ def _show_warning(message: Warning | str, *_: Any) -> None:
 
 
 def folder_for(run: Path) -> Path:
-    """Where what is made of a run goes by default: its folder, or runs/<name> if it is bundled."""
-    return Path("runs") / run.name if is_bundled(run) else run
+    """Where what is made of a run goes by default: its folder.
+
+    It is runs/<name> for a bundled agent, and for a row of the scoreboard, which has no network.
+    """
+    is_row = (run / "run.json").is_file() and not (run / "checkpoints").exists()
+    return Path("runs") / run.name if is_bundled(run) or is_row else run
 
 
 def check_new_file(path: Path, in_folder: bool = True) -> None:

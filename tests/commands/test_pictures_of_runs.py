@@ -280,6 +280,22 @@ def test_failures_are_sorted_and_some_can_be_looked_at(
         assert picture.width > 500
 
 
+def test_failures_of_a_row_of_the_scoreboard_go_into_runs(
+    tmp_path, monkeypatch, rooms_file, opinionated_run
+):
+    row = tmp_path / "results" / "my-row"
+    row.mkdir(parents=True)
+    for name in ("config.json", "episodes.jsonl"):
+        shutil.copy(opinionated_run / name, row)
+    (row / "run.json").write_text("{}")
+    held = sorted(row.iterdir())
+    monkeypatch.chdir(tmp_path)
+    words = ["--checkpoint", str(row), "--data", str(rooms_file), "--replays", "0"]
+    failures.main(words)
+    assert sorted(row.iterdir()) == held
+    assert (tmp_path / "runs" / "my-row" / "failures" / "failures.md").is_file()
+
+
 def test_failures_of_a_point_of_the_history_are_refused(tmp_path, capsys, opinionated_run):
     point = opinionated_run / "history" / "000001.npz"
     with pytest.raises(SystemExit):
