@@ -42,7 +42,8 @@ def summarise(
       collided: [E] bool, whether a MoveAhead was blocked; without it, CF-SR and CF-SPL are missing.
 
     Returns:
-      bucket -> each of `MEASURES`, its interval (SR_ci, [low, high]), and n; None where n is 0.
+      bucket -> each of `MEASURES`, its interval (SR_ci, [low, high]), and n; None where n is 0, and
+      no interval where all episodes are of one cluster.
       The collision-free measures, CF-SR and CF-SPL, count episodes that collided as failed.
     """
     return _averages(_rates(success, shortest, length, collided), shortest, cluster)
@@ -92,12 +93,14 @@ def _averages(
             nothing = (*measures, *(f"{measure}_ci" for measure in measures))
             out[name] = {**dict.fromkeys(nothing), "n": 0}
             continue
-        low, high = cluster_interval(values[:, chosen], cluster[chosen])
+        bounds = cluster_interval(values[:, chosen], cluster[chosen])
         mean = values[:, chosen].mean(axis=1)
-        ends = zip(map(_round, low), map(_round, high), strict=True)
         out[name] = {
             **dict(zip(measures, map(_round, mean), strict=True)),
-            **{f"{m}_ci": [*both] for m, both in zip(measures, ends, strict=True)},
+            **{
+                f"{measure}_ci": None if bounds is None else [_round(b[i]) for b in bounds]
+                for i, measure in enumerate(measures)
+            },
             "n": count,
         }
     return out
@@ -107,13 +110,15 @@ def shown(bucket: Mapping[str, Any], measure: str) -> str:
     """A mean and its interval, if there is one, as in every table: 75.1 (70.2 to 80.0)."""
     if bucket.get(measure) is None:
         return "-"
-    if f"{measure}_ci" not in bucket:
-        return f"{bucket[measure]:.1f}"
-    low, high = bucket[f"{measure}_ci"]
+    if (ends := bucket.get(f"{measure}_ci")) is None:
+        return f"{bucket[measure]:z.1f}"
+    low, high = ends
     return f"{bucket[measure]:z.1f} ({low:z.1f} to {high:z.1f})"
 
 
-def cluster_interval(values: np.ndarray, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cluster_interval(
+    values: np.ndarray, cluster: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Percentile bootstrap interval of means, resampling whole clusters.
 
     Args:
@@ -121,10 +126,12 @@ def cluster_interval(values: np.ndarray, cluster: np.ndarray) -> tuple[np.ndarra
       cluster: [E] int.
 
     Returns:
-      Lower and upper bound, [M] each.
+      Lower and upper bound, [M] each; None if there is one cluster, which says nothing about others.
     """
     _, member = np.unique(cluster, return_inverse=True)
     clusters = int(member.max()) + 1
+    if clusters == 1:
+        return None
     sums = np.stack([np.bincount(member, row, clusters) for row in values])  # [M, clusters]
     sizes = np.bincount(member, minlength=clusters)
     rng = np.random.default_rng(0)

@@ -153,10 +153,15 @@ def columns(
     }
 
 
-def _results(
-    provenance: Provenance, groups: Mapping[str, Columns], tables: SceneTables
-) -> dict[str, Any]:
-    """The content of `results.json`."""
+def figures(tables: SceneTables, played: Played, by_class: bool = False) -> dict[str, Any]:
+    """What follows from the records of an evaluation alone: the results in `results.json`.
+
+    Args:
+      tables: the rooms.
+      played: the episodes and what happened in them, by group.
+      by_class: intervals resample target classes instead of (room, target) pairs.
+    """
+    groups = {name: columns(tables, *pair, by_class) for name, pair in played.items()}
 
     def by(key: str, names: tuple[str, ...]) -> dict:
         pairs = {"cluster": "pair"} if key == "target" else {}  # one class cannot be resampled
@@ -170,17 +175,11 @@ def _results(
             for name in found
         }
 
-    origin = dataclasses.asdict(provenance)
-    origin |= {name: name in provenance.sensors for name in FLAGS}
-    origin["sensors"] = list(provenance.sensors)
     return {
-        "version": RESULTS_VERSION,
-        **{name: origin.pop(name) for name in _HEAD},
         **{name: _summary(groups[name]) if name in groups else None for name in GROUPS},
         "by_room": by("room", tables.room_types),
         "by_target": by("target", in_order(tables.targets)),
-        **origin,
-        "commit": code_version(),
+        "actions": {name: _shares(records) for name, (_, records) in played.items()},
     }
 
 
@@ -249,10 +248,18 @@ def results(
     """
     folder = None if folder is None else Path(folder)
     by_class = is_open(provenance.split)
-    groups = {name: columns(tables, *pair, by_class) for name, pair in played.items()}
-    out = _results(provenance, groups, tables)
-    out["actions"] = {name: _shares(records) for name, (_, records) in played.items()}
+    origin = dataclasses.asdict(provenance)
+    origin |= {name: name in provenance.sensors for name in FLAGS}
+    origin["sensors"] = list(provenance.sensors)
+    out = {
+        "version": RESULTS_VERSION,
+        **{name: origin.pop(name) for name in _HEAD},
+        **figures(tables, played, by_class),
+        **origin,
+        "commit": code_version(),
+    }
     if folder is not None:
+        groups = {name: columns(tables, *pair, by_class) for name, pair in played.items()}
         folder.mkdir(parents=True, exist_ok=True)
         write_rows(folder, all_rows(tables, played))
         files.write_text(folder / RESULTS_PAGE, markdown(out, groups))

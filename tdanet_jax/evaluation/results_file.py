@@ -75,7 +75,7 @@ def check_groups(path: Path, groups: Any, where: str) -> None:
                 if measure not in part:
                     raise FileError(path, f"{place}, {measure}: missing")
                 if part[measure] is not None:
-                    ends = part.get(f"{measure}_ci", [])
+                    ends = part.get(f"{measure}_ci") or []
                     if not isinstance(ends, list) or len(ends) not in (0, 2):
                         raise FileError(path, f"{place}, {measure}_ci: not an interval")
                     for value in (part[measure], *ends):

@@ -24,12 +24,12 @@ from tdanet_jax import config as configs
 from tdanet_jax.analysis import episode_lookup
 from tdanet_jax.config import BUDGETS, CONFIG_FILE, PRESETS, TrainConfig
 from tdanet_jax.eval_config import describe_departures
-from tdanet_jax.evaluation import comparison, episodes, metrics, report, results_file, rollout
+from tdanet_jax.evaluation import comparison, episodes, report, results_file, rollout
 from tdanet_jax.evaluation.comparison import Result
 from tdanet_jax.evaluation.policies import Policy
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import FileError, jsons, regular
-from tdanet_jax.splits import GROUPS, NAMED, OF_VALIDATION, OPEN, is_open, make_split
+from tdanet_jax.splits import NAMED, OF_VALIDATION, OPEN, is_open, make_split
 from tdanet_jax.targets import PAPER
 from tdanet_jax.task import Task, load_task
 from tdanet_jax.training import journal, run_file
@@ -327,13 +327,9 @@ def _check_episodes(run: Path, results: Result) -> None:
     for (number, line), right in zip(jsons.load_lines(path, links=False), expected, strict=True):
         if line != right:
             raise FileError(f"{path}, line {number}", "not what these actions do in this episode")
-    summaries = {}
-    for group, pair in played.items():
-        columns = report.columns(task.tables, *pair, by_class=is_open(split))
-        summaries[group] = metrics.summarise(*(columns[name] for name in metrics.COLUMNS))
-    for group in GROUPS:
-        if results.get(group) != summaries.get(group):
-            raise FileError(run / report.RESULTS_FILE, f"{group}: not what the episodes give")
+    for name, value in report.figures(task.tables, played, by_class=is_open(split)).items():
+        if results.get(name) != value:
+            raise FileError(run / report.RESULTS_FILE, f"{name}: not what the episodes give")
 
 
 @functools.cache
