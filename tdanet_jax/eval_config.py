@@ -151,6 +151,7 @@ def describe_departures(departures: Mapping[str, Any]) -> str:
         "reach_threshold": "Done with a probability of reach of {} or more",
         "temperature": "a temperature of {}",
         "done_bias": "{} added to the logit of Done",
+        "word_vectors": "word vectors of {}",
     }
     parts = [
         text.format(

@@ -189,7 +189,7 @@ def _sum_pairs(
 def write_csv(pairs: ClassPairs, path: Path | str) -> None:
     """Every pair that occurs, one a line: target, class, frames, attention, even."""
     path = Path(path)
-    with path.open("w", newline="") as file:
+    with path.open("w", encoding="utf-8", newline="") as file:
         table = csv.DictWriter(file, ["target", "class", "frames", "attention", "even"])
         table.writeheader()
         table.writerows(pairs.rows())

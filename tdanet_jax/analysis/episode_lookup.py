@@ -125,7 +125,10 @@ def _lines(run: Path | str) -> tuple[Path, list[str]]:
     try:
         return path, regular.read_text(path, links=False).splitlines()
     except FileNotFoundError:
-        raise ValueError(f"{path}: no such file; a run writes it when training ends") from None
+        raise ValueError(
+            f"{path}: no such file; a run writes it when training ends (rows of "
+            "results/validation/ have none)"
+        ) from None
 
 
 def _parse(path: Path, index: int, line: str, tables: SceneTables) -> Recorded:

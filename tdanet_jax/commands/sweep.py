@@ -42,6 +42,7 @@ from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
 from tdanet_jax.eval_config import OWN_TASK, rooms_played
 from tdanet_jax.io import files
 from tdanet_jax.splits import file_name
+from tdanet_jax.targets import PAPER
 from tdanet_jax.training import cluster
 from tdanet_jax.workflows import sweep, sweep_report
 from tdanet_jax.workflows.sweep import FinishedRun
@@ -374,8 +375,9 @@ def check_alike(runs: Sequence[FinishedRun], planned: Sequence[Path] = ()) -> No
     first: dict[str, FinishedRun] = {}
     for run in runs:
         alike = first.setdefault(run.results["split"], run)
-        if run.results["data_version"] != alike.results["data_version"]:
-            fail(f"{run.folder}: was evaluated on other scene tables than {alike.folder}")
+        for field, what in (("data_version", "scene tables"), ("targets", "targets")):
+            if run.results.get(field, PAPER) != alike.results.get(field, PAPER):
+                fail(f"{run.folder}: was evaluated on other {what} than {alike.folder}")
 
 
 def costs(runs: Sequence[FinishedRun]) -> dict[str, Cost]:

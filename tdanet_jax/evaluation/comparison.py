@@ -58,6 +58,20 @@ def settings(config: TrainConfig) -> dict[str, Any]:
     return {flag: value for flag, value in flags(config).items() if flag not in NOT_SETTINGS}
 
 
+class _Test(NamedTuple):
+    """What results must have in common to stand in one table."""
+
+    split: str
+    targets: str
+    data_version: str
+    data: str | None
+
+
+def _test(result: Result) -> _Test:
+    targets = result.get("targets") or PAPER
+    return _Test(result["split"], targets, result["data_version"], result["data"])
+
+
 class _Kind(NamedTuple):
     """What repetitions of a run have in common."""
 
@@ -229,7 +243,8 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
       results: as `saved_networks.Evaluated.results` gives them.
       runs: a short name for each; points of one run, which are not averaged, share one.
     """
-    departures = results[0].get("departures") if results else None  # all are played alike
+    # All are played alike, but some may have other word vectors than their own.
+    departures = next((found for r in results if (found := r.get("departures"))), None)
     where = rooms_played(departures, [result["split"] for result in results])
     lines = [
         f"# {in_markdown(title)}",
@@ -238,29 +253,31 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
     ]
     if departures:
         lines += ["", f"**{in_markdown(describe_departures(departures))}.**"]
-    for split in dict.fromkeys(result["split"] for result in results):
-        own = [result for result in results if result["split"] == split]
-        names = [run for run, r in zip(runs, results, strict=True) if r["split"] == split]
+    tests = [_test(result) for result in results]
+    for test in dict.fromkeys(tests):
+        own = [result for result, of in zip(results, tests, strict=True) if of == test]
+        names = [run for run, of in zip(runs, tests, strict=True) if of == test]
         rows: list[_Row] = [
             ((in_markdown(run), f"{r['updates']:,}", f"{r['episodes_trained']:,}", r["policy"]), r)
             for run, r in zip(names, own, strict=True)
         ]
         rows += (differing := list(_differences(own, names)))
         rows += _means(own, names)
-        targets = [*dict.fromkeys(result.get("targets") or PAPER for result in own)]
-        compared = targets == [PAPER] and not departures
-        published = paper.rates(split, PAPER) if compared else {}
+        compared = test.targets == PAPER and not departures
+        published = paper.rates(test.split, PAPER) if compared else {}
         for agent, groups in published.items():
             rows.append(((f"{agent} (paper)", "", "", ""), groups))
-        lines += ["", f"## Split {split}", ""]
-        if {*targets} - {PAPER, OPEN}:
-            lines += [f"Targets: {in_markdown('; '.join(targets))}.", ""]
+        lines += ["", f"## Split {test.split}", ""]
+        if test.targets not in (PAPER, OPEN):
+            lines += [f"Targets: {in_markdown(test.targets)}.", ""]
+        if len({(of.data_version, of.data) for of in tests}) > 1:
+            rooms = "the bundled ones" if test.data is None else in_markdown(test.data)
+            lines += [f"Rooms: {rooms}, scene tables {test.data_version}.", ""]
         lines += table(("Agent", "Updates", "Training episodes", "Actions"), rows)
         if differing:
             lines += ["", "Differences: in the same episodes, 95 % intervals (paired bootstrap)."]
         if published:
-            worlds = dict.fromkeys(paper.worlds(result["data"]) for result in own)
-            lines += ["", *worlds]
+            lines += ["", paper.worlds(test.data)]
     return "\n".join(lines) + "\n"
 
 

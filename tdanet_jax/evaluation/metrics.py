@@ -126,7 +126,7 @@ def cluster_interval(
       cluster: [E] int.
 
     Returns:
-      Lower and upper bound, [M] each; None if there is one cluster, which says nothing about others.
+      Lower and upper bound, [M] each; None of a single cluster, which says nothing of others.
     """
     _, member = np.unique(cluster, return_inverse=True)
     clusters = int(member.max()) + 1

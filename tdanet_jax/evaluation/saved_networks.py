@@ -7,6 +7,7 @@ compilation.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from flax import traverse_util
 
 from tdanet_jax import config as configs
 from tdanet_jax import words
@@ -53,9 +56,33 @@ class SavedNetwork:
         """The run's configuration with the files that it is evaluated with."""
         return self.test.locate(self.config, self.run)
 
+    @property
+    def departures(self) -> dict[str, Any]:
+        """`EvalConfig.departures`, and the word vectors if they are not those of the training."""
+        own = self.config.word_vectors is not None and not os.path.lexists(
+            self.run / WORD_VECTORS_FILE
+        )  # then `--word-vectors` says where a file is that the run holds no copy of
+        words = {} if own or self.test.word_vectors is None else {
+            "word_vectors": self.test.word_vectors
+        }  # fmt: skip
+        return self.test.departures | words
+
     def load(self) -> Snapshot:
         """Reads the network. Raises ValueError if it cannot be read."""
         return newest(self.run) if self.point is None else history.read(self.point)
+
+    def fingerprint(self, snapshot: Snapshot) -> str:
+        """Twelve digits that tell this agent from others: its network, and how it sees and decides.
+
+        Args:
+          snapshot: its network, from `load`.
+        """
+        digest = hashlib.sha256(str(dataclasses.replace(_task_config(self), data=None)).encode())
+        arrays = traverse_util.flatten_dict(jax.device_get(snapshot.weights), sep="/")
+        for name, array in sorted(arrays.items()):
+            digest.update(f"{name} {array.shape} {array.dtype}".encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()[:12]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,7 +250,7 @@ def evaluate(
                         drawn,
                         snapshot.episodes,
                         snapshot.updates,
-                        network.test.departures,
+                        network.departures,
                         network.config.targets,
                     ),
                     played=records,

@@ -24,7 +24,7 @@ from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.sense_noise import SWEEP_FILE
 from tdanet_jax.splits import GROUPS, OF_VALIDATION
-from tdanet_jax.training.history import Snapshot
+from tdanet_jax.task import load_task
 from tdanet_jax.workflows.evaluate import short_names
 
 Row = dict[str, Any]
@@ -77,10 +77,11 @@ def evaluate_noise(
         if folder is not None:
             files.remove_partial(folder)
         levels = _levels(checkpoints, test, plan)
-        rows = {} if folder is None else _there(folder / SWEEP_FILE, levels, policy, seed)
+        same = {level.row["agent"]: level.same(policy, seed) for level in levels if level.is_clean}
+        rows = {} if folder is None else _there(folder / SWEEP_FILE, levels, same)
         if on_network is not None:
             on_network(len(rows) / len(levels), f"{len(rows)} of {len(levels)} levels are there")
-        for i, row in _played(levels, rows, policy, seed):
+        for i, row in _played(levels, rows, same, policy == "greedy", seed):
             rows[i] = row
             if folder is not None:
                 text = json.dumps([rows[i] for i in sorted(rows)], indent=2) + "\n"
@@ -110,17 +111,17 @@ class _Level:
         """Whether it is without noise."""
         return self.row["kind"] is None
 
-    def same(self, snapshot: Snapshot, policy: str, seed: int | None) -> Row:
+    def same(self, policy: str, seed: int | None) -> Row:
         """What is known of its row before it is played, and equal for all rows of the agent."""
-        test = self.network.test
-        own = test.data is None and test.test_targets is None
+        snapshot, test = self.network.load(), self.network.test
+        noiseless = dataclasses.replace(test, noise=None)
         return {
+            "network": self.network.fingerprint(snapshot),
             "policy": policy,
             "updates": snapshot.updates,
             "evaluation_seed": self.network.config.seed if seed is None else seed,
-            **({"data_version": snapshot.data_version} if own else {}),
             "test_targets": test.test_targets,
-            "departures": dataclasses.replace(test, noise=None).departures or None,
+            "departures": dataclasses.replace(self.network, test=noiseless).departures or None,
         }
 
 
@@ -143,8 +144,13 @@ def _levels(
     return out
 
 
-def _there(path: Path, levels: Sequence[_Level], policy: str, seed: int | None) -> dict[int, Row]:
+def _there(path: Path, levels: Sequence[_Level], same: Mapping[str, Row]) -> dict[int, Row]:
     """The rows that a sweep has written, by their place among all.
+
+    Args:
+      path: of `noise.json`.
+      levels: all that the sweep plays.
+      same: what all rows of an agent must have, by its name.
 
     Raises:
       FileError: they are of other agents, levels, episodes or seeds, or the file is broken.
@@ -153,7 +159,7 @@ def _there(path: Path, levels: Sequence[_Level], policy: str, seed: int | None) 
         return {}
     content = jsons.load(path, links=False)
     heads = [level.row for level in levels]
-    same: dict[str, Row] = {}
+    versions: dict[str, str] = {}
     out = {}
     if not isinstance(content, list):
         raise FileError(path, "not the rows of a sweep")
@@ -164,9 +170,10 @@ def _there(path: Path, levels: Sequence[_Level], policy: str, seed: int | None) 
             what = f"{head['agent']}, {head['kind'] or 'no noise'} {head['name']}"
             raise FileError(path, f"holds {what}, which is not asked for; choose another --out")
         level = levels[i := heads.index(head)]
-        if (agent := level.row["agent"]) not in same:
-            same[agent] = level.same(level.network.load(), policy, seed)
-        if differing := [name for name, value in same[agent].items() if row.get(name) != value]:
+        if (agent := level.row["agent"]) not in versions:
+            versions[agent] = load_task(level.network.located).tables.data_version
+        expected = {**same[agent], "data_version": versions[agent]}
+        if differing := [name for name, value in expected.items() if row.get(name) != value]:
             raise FileError(
                 path,
                 f"{agent} was played with other values of {', '.join(differing)}; "
@@ -177,7 +184,11 @@ def _there(path: Path, levels: Sequence[_Level], policy: str, seed: int | None) 
 
 
 def _played(
-    levels: Sequence[_Level], rows: Mapping[int, Row], policy: str, seed: int | None
+    levels: Sequence[_Level],
+    rows: Mapping[int, Row],
+    same: Mapping[str, Row],
+    greedy: bool,
+    seed: int | None,
 ) -> Iterator[tuple[int, Row]]:
     """Plays the levels that have no row, and gives their places and rows."""
     agents = {level.row["agent"] for i, level in enumerate(levels) if i not in rows}
@@ -187,7 +198,7 @@ def _played(
     place = {id(level.network): i for i, level in enumerate(levels)}
     clean: dict[str, Mapping[str, report.Columns]] = {}
     # Runs of one task are played in the order in which they are given, each from its first level.
-    for done in saved_networks.evaluate(networks, policy == "greedy", seed):
+    for done in saved_networks.evaluate(networks, greedy, seed):
         level, columns = levels[i := place[id(done.saved)]], done.columns()
         before = clean.setdefault(level.row["agent"], columns)
         row = {
@@ -196,7 +207,7 @@ def _played(
                 columns, lambda part: metrics.summarise(*(part[c] for c in metrics.COLUMNS))
             ),
             "change": None if level.is_clean else _changes(columns, before),
-            **level.same(done.snapshot, policy, seed),
+            **same[level.row["agent"]],
             "data_version": done.provenance.data_version,
         }
         if i not in rows:

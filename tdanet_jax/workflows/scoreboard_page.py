@@ -46,7 +46,8 @@ def pages(root: Path | str, rows: Sequence[Row]) -> dict[Path, str]:
       FileError: a block has no end, or names no row.
     """
     root = Path(root)
-    found = {path: path.read_text() for path in (root / "README.md", *root.glob("docs/**/*.md"))}
+    paths = (root / "README.md", *root.glob("docs/**/*.md"))
+    found = {path: path.read_text(encoding="utf-8") for path in paths}
     return {
         path: filled(path, text, rows)
         for path, text in found.items()
@@ -212,7 +213,7 @@ def write(root: Path | str, rows: Sequence[Row]) -> list[Path]:
     """
     root, changed = Path(root), []
     for path, text in pages(root, rows).items():
-        if path.read_text() != text:
+        if path.read_text(encoding="utf-8") != text:
             files.write_text(path, text)
             changed.append(path)
     for split in NAMED:

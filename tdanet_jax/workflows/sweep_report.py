@@ -73,9 +73,10 @@ def make_curves(runs: Sequence[FinishedRun], out: Path) -> dict[str, list[Curve]
         if results:
             found.setdefault(run.results["split"], {}).setdefault(label, []).append(results)
     return {
-        split: [comparison.curve(label, seeds) for label, seeds in by_label.items()]
+        split: [curve for label, seeds in by_label.items()
+                if (curve := comparison.curve(label, seeds)).episodes]
         for split, by_label in found.items()
-    }
+    }  # fmt: skip
 
 
 def to_json(report: Report) -> dict[str, Any]:
@@ -142,13 +143,16 @@ def left_out(report: Report) -> list[str]:
         elif absent:
             lines.append(f"Split {split}: not trained: {', '.join(absent)}.")
     drawn = {(split, curve.label) for split, curves in report.curves.items() for curve in curves}
-    flat = [
-        run.folder.name
-        for label, run in zip(labels(report.runs), report.runs, strict=True)
-        if (run.results["split"], label) not in drawn
-    ]
-    if flat:
-        lines.append(f"Learning curve: no history of {', '.join(flat)}.")
+    seeds: dict[tuple[str, str], list[FinishedRun]] = {}
+    for label, run in zip(labels(report.runs), report.runs, strict=True):
+        seeds.setdefault((run.results["split"], label), []).append(run)
+    for curve, runs in seeds.items():
+        names = ", ".join(run.folder.name for run in runs)
+        points = {run.config.history for run in runs}
+        if len(points) > 1:
+            lines.append(f"Learning curve: the histories of {names} have points in common alone.")
+        elif curve not in drawn:
+            lines.append(f"Learning curve: no history of {names}.")
     return lines
 
 

@@ -143,6 +143,11 @@ def test_what_cannot_stand_in_one_report_shows_before_anything_is_trained(tmp_pa
     with pytest.raises(SystemExit):
         sweep.main(["--seeds", "2", "--steps", "1", "--out", str(out), "--include", str(elsewhere)])
     assert "evaluated on other scene tables than" in capsys.readouterr().err
+    run = out / "18-4-tdanet-seed1"
+    (run / "results.json").write_text(json.dumps(result(1) | {"targets": "Mug,Vase"}))
+    with pytest.raises(SystemExit):
+        sweep.main(["--seeds", "2", "--steps", "1", "--out", str(out), "--include", str(elsewhere)])
+    assert "evaluated on other targets than" in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ["18-4-tdanet-seed1"]
 
 

@@ -80,6 +80,22 @@ def test_the_page_says_which_targets_were_tested():
     assert "(paper)" in page
 
 
+def test_other_tests_stand_in_other_tables():
+    """Other rooms, or other targets: neither side by side nor in one mean."""
+    houses = result(2, 20.0) | {"data": "house.npz", "data_version": "h"}
+    some = result(3, 30.0) | {"targets": "Mug,Vase"}
+    page = comparison.markdown("Four", [result(0), houses, some, result(1)], "abcd")
+    paper, house, few = page.split("## Split 18/4")[1:]
+    assert "**tdanet, 2 seeds**" in paper
+    assert "| TDANet (paper) |" in paper
+    assert "Rooms: the bundled ones, scene tables d." in paper
+    assert "Rooms: house.npz, scene tables h." in house
+    assert "| b | 0 |" in house
+    assert "Targets: Mug,Vase." in few
+    assert "(paper)" not in few
+    assert "seeds**" not in house + few
+
+
 def test_a_history_is_not_averaged_over_its_points():
     page = comparison.markdown("Two", [result(point=0), result(point=1)], ["a", "a"])
     assert "seeds" not in page

@@ -126,12 +126,14 @@ def figures(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
         cluster = np.array([pairs.index((row["scene"], row["target"])) for row in chosen])
         free = [[v * (not row["collided"]) for v, row in zip(values, chosen, strict=True)]
                 for values in (rate, spl)]  # fmt: skip
-        low, high = metrics.cluster_interval(np.array([rate, spl, *free]), cluster)
+        ends = metrics.cluster_interval(np.array([rate, spl, *free]), cluster)
+        assert (ends is None) == (len(pairs) == 1)
         out[bucket] = {"n": len(chosen)}
         for i, values in enumerate((rate, spl, *free)):
             mean = sum(values) / len(values)
             out[bucket][MEASURES[i]] = pytest.approx(mean, abs=0.006)
-            out[bucket][f"{MEASURES[i]}_ci"] = pytest.approx([low[i], high[i]], abs=0.006)
+            interval = ends and pytest.approx([end[i] for end in ends], abs=0.006)
+            out[bucket][f"{MEASURES[i]}_ci"] = interval
     return out
 
 
@@ -173,6 +175,8 @@ def cells(first: Sequence[str], buckets: Mapping[str, Mapping[str, Any]]) -> str
         for name in MEASURES:
             if part[name] is None:
                 out.append("-")
+            elif part[f"{name}_ci"] is None:
+                out.append(f"{part[name]:.1f}")
             else:
                 low, high = part[f"{name}_ci"]
                 out.append(f"{part[name]:.1f} ({low:.1f} to {high:.1f})")

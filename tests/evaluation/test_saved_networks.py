@@ -21,7 +21,8 @@ from tdanet_jax.analysis import trace
 from tdanet_jax.commands import share
 from tdanet_jax.commands.train_zero_shot import main as train
 from tdanet_jax.config import CONFIG_FILE, WORD_VECTORS_FILE, TrainConfig
-from tdanet_jax.eval_config import EvalConfig
+from tdanet_jax.decisions import Decisions
+from tdanet_jax.eval_config import EvalConfig, describe_departures
 from tdanet_jax.evaluation import report, saved_networks
 from tdanet_jax.io import bundled_agents
 from tdanet_jax.scenes import SceneTables, dataset
@@ -237,10 +238,40 @@ def test_a_run_without_a_copy_says_where_its_word_vectors_were(
     with pytest.raises(ValueError, match=gone):
         saved_networks.share(run_of_files, tmp_path / "shared")
     assert not (tmp_path / "shared").exists()
+    network = saved_networks.find(run_of_files, test=EvalConfig(word_vectors=str(moved)))[0]
+    assert network.departures == {}
     agent = tdanet_jax.load(run_of_files, word_vectors=moved)
     np.testing.assert_array_equal(decision(run_of_files, agent), before)
     saved_networks.share(run_of_files, tmp_path / "shared", moved)
     assert decision(tmp_path / "shared").shape == before.shape
+
+
+def test_other_word_vectors_than_those_of_the_training_are_no_official_test(
+    opinionated_run: Path, run_of_files: Path
+) -> None:
+    """Neither for a run with the bundled ones nor for one with a copy of its own."""
+    other = str(run_of_files.parent / "vectors.npz")
+    for run in (opinionated_run, run_of_files):
+        assert saved_networks.find(run)[0].departures == {}
+        network = saved_networks.find(run, test=EvalConfig(word_vectors=other))[0]
+        assert network.departures == {"word_vectors": other}
+    departures = describe_departures({"word_vectors": "w.npz"})
+    assert departures == "Not the official test: word vectors of w.npz"
+
+
+def test_a_fingerprint_tells_networks_and_their_decisions_apart(opinionated_run: Path) -> None:
+    network = saved_networks.find(opinionated_run)[0]
+    snapshot = network.load()
+    same = network.fingerprint(network.load())
+    assert network.fingerprint(snapshot) == same
+    other = jax.tree.map(lambda leaf: leaf + np.float32(1e-3), snapshot.weights)
+    decisions = dataclasses.replace(network, test=EvalConfig(decisions=Decisions(done_bias=1.0)))
+    found = {
+        same,
+        network.fingerprint(dataclasses.replace(snapshot, weights=other)),
+        decisions.fingerprint(snapshot),
+    }
+    assert len(found) == 3
 
 
 def test_word_vectors_of_another_width_are_refused(run_of_files: Path, tmp_path: Path) -> None:

@@ -373,7 +373,7 @@ def generalised_advantages(
 
 def paired_differences(
     ours: Mapping[str, Sequence], theirs: Mapping[str, Sequence], chosen: Sequence[int]
-) -> list[tuple[float, float, float]]:
+) -> list[tuple[float, tuple[float, float] | None]]:
     """Of SR and of SPL: the difference, and the ends of its interval, from whole samples.
 
     A sample takes as many clusters as there are, with replacement, and all their episodes; the
@@ -393,8 +393,8 @@ def paired_differences(
         drawn = [i for count, own in zip(counts, members, strict=True) for i in own * count]
         samples.append(rates(ours, drawn) - rates(theirs, drawn))
     means = rates(ours, chosen) - rates(theirs, chosen)
-    ends = np.percentile(samples, [2.5, 97.5], axis=0)
-    return [(means[k], ends[0][k], ends[1][k]) for k in (0, 1)]
+    low, high = np.percentile(samples, [2.5, 97.5], axis=0)
+    return [(means[k], (low[k], high[k]) if len(clusters) > 1 else None) for k in (0, 1)]
 
 
 def success_rate_and_spl(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -83,9 +85,14 @@ def test_a_sweep_compares_each_level_with_the_agent_without_noise(
         with pytest.raises(ValueError, match=message):
             sweep()
         assert json.loads(path.read_text()) == there
-    path.write_text(json.dumps(rows[:1]))
+    path.write_text(json.dumps(rows))
     with pytest.raises(ValueError, match="other values of evaluation_seed"):
         sweep(seed=5)
+    shutil.rmtree(run)  # another agent in the place of this one
+    network = dataclasses.replace(TINY.network, done_bias=1.0)
+    save_untrained(dataclasses.replace(TINY, network=network), run, ithor, glove)
+    with pytest.raises(ValueError, match="other values of network"):
+        sweep(seed=TINY.seed)
 
 
 @pytest.mark.parametrize(("there", "continues"), [("noise.json", True), ("results.json", False)])

@@ -174,6 +174,8 @@ def test_a_run_of_an_earlier_version_is_told_about(run: Path, tmp_path: Path) ->
             "run: made with changes that are not committed, abc-dirty",
         ),
         (("results.json", {"unseen": None}), "results.json: unseen: not what the episodes give"),
+        (("results.json", {"by_target": {}}), "results.json: by_target: not what the episodes"),
+        (("results.json", {"actions": {}}), "results.json: actions: not what the episodes give"),
     ],
 )
 def test_what_can_be_no_row_is_refused_in_one_line(
