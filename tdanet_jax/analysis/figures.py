@@ -26,6 +26,8 @@ from tdanet_jax.io.escaping import in_figure
 from tdanet_jax.splits import GROUPS
 
 DPI = 130
+#: Points of a learning curve, at most: enough to see its shape, too few to see its noise.
+PARTS = 60
 #: Line style, colour and label of what training keeps in memory.
 _MEMORY = {
     "temporary_mb": ("s-", ORANGE, "rollout and activation cache"),
@@ -69,10 +71,12 @@ def training_curves(
     path: Path,
     comment: str | None = None,
 ) -> None:
-    """SR and SPL in the training rooms against environment steps, a line for each run.
+    """SR and SPL in the training rooms against environment steps, a line for each agent.
+
+    Lines are means over an agent's runs and over steps, in `PARTS` parts of the logarithmic axis.
 
     Args:
-      runs: a label and the rows of `metrics.jsonl` of each; runs of one label are drawn alike.
+      runs: a label and the rows of `metrics.jsonl` of each; runs of one label are one agent.
       title: above both panels.
       path: the picture's file.
       comment: unseen, in the file; it must be a PNG then.
@@ -83,20 +87,27 @@ def training_curves(
     figure = Figure(figsize=(9, 3.8 + 0.19 * text_lines), layout="constrained")
     axes = figure.subplots(1, 2)
     styles = [(color, dashes) for dashes in ("-", "--", ":", "-.") for color in PALETTE]
+    rows = {label: [row for name, own in runs if name == label for row in own] for label in labels}
+    every = [row["steps"] / 1e6 for own in rows.values() for row in own]
+    edges = np.geomspace(min(every), max(every), PARTS + 1)
     for axis, measure, name in zip(axes, MEASURES, ("success", "spl"), strict=True):
-        for label, rows in runs:
-            rates = 100 * np.array([row[name] for row in rows], float)  # None becomes NaN: a gap
-            color, dashes = styles[labels.index(label) % len(styles)]
-            steps = [row["steps"] / 1e6 for row in rows]
-            axis.plot(steps, rates, dashes, color=color, linewidth=1)
-        axis.set(xlabel="million environment steps", ylim=(0, 100), xlim=(0, None))
+        for index, own in enumerate(rows.values()):
+            steps = np.array([row["steps"] / 1e6 for row in own])
+            rates = 100 * np.array([row[name] for row in own], float)  # None becomes NaN
+            known = ~np.isnan(rates)
+            part = np.searchsorted(edges[1:-1], steps, side="right")
+            parts = [known & (part == i) for i in np.unique(part[known])]
+            color, dashes = styles[index % len(styles)]
+            x, y = ([values[one].mean() for one in parts] for values in (steps, rates))
+            axis.plot(x, y, dashes, color=color, linewidth=1.2)
+        axis.set(xlabel="million environment steps", ylim=(0, 100), xscale="log")
+        axis.xaxis.set_major_formatter("{x:g}")
         axis.set(ylabel=f"{measure}, per cent, training rooms")
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
     figure.suptitle(_in_lines(title))
-    lines = {label: line for (label, _), line in zip(runs, axes[0].lines, strict=True)}
-    names = [listed[label] for label in lines]
-    figure.legend(lines.values(), names, loc="outside lower left", fontsize=8, frameon=False)
+    names = [listed[label] for label in rows]
+    figure.legend(axes[0].lines, names, loc="outside lower left", fontsize=8, frameon=False)
     drawing.save(figure, path, DPI, comment)
 
 

@@ -43,3 +43,20 @@ def test_training_curves_have_room_for_many_agents_and_long_names(
     assert min(heights) > 2.5 * figure.dpi
     looks = {(line.get_color(), line.get_linestyle()) for line in figure.axes[0].lines}
     assert len(looks) == len(names)
+
+
+def test_a_training_curve_is_the_mean_over_runs_and_over_nearby_steps(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(drawing, "save", lambda figure, *_: drawn.append(figure))
+    rows = [{"steps": 1000 * n, "success": n % 2, "spl": 0.25} for n in range(1, 10001)]
+    first = {"steps": 1000, "success": None, "spl": None}  # no episode has finished
+    other = [first, {"steps": 1_000_000, "success": 1.0, "spl": 1.0}]
+    runs = [("a", rows), ("b", other), ("a", rows[:5000])]
+    figures.training_curves(runs, "Split", tmp_path / "a.png")
+    many, few = drawn[0].axes[0].lines
+    assert 30 < len(many.get_xdata()) <= figures.PARTS
+    late = [y for x, y in zip(*many.get_data(), strict=True) if x > 1]
+    assert late == pytest.approx([50] * len(late), abs=1)
+    assert [*zip(*few.get_data(), strict=True)] == [(1.0, 100.0)]
