@@ -172,20 +172,24 @@ def _check_longer(run: Run) -> None:
 
 
 def _prepare(run: Run, callbacks: Callbacks) -> None:
-    """Writes what a run's folder holds from the start."""
+    """Writes what a run's folder holds from the start; `--resume` writes what is missing anew.
+
+    The configuration comes first: a folder that has one can be resumed, any other is still new.
+    """
     folder, task = run.folder, run.task
-    regular.check_tree(folder)  # where a link leads, nothing is written or deleted
-    for path in files.remove_partial(folder) + files.remove_partial(folder / checkpoint.FOLDER):
-        callbacks.on_note(f"removed {path}: half-written when the run was stopped")
-    if run.config.word_vectors is not None and not (folder / WORD_VECTORS_FILE).exists():
-        task.vectors.save_copy(folder / WORD_VECTORS_FILE, task.tables.classes)
-    if run.progress < 1.0:  # results there are of a former budget, which this run goes beyond
-        for name in (report.RESULTS_FILE, report.RESULTS_PAGE, report.EPISODES_FILE):
-            (folder / name).unlink(missing_ok=True)
-    task.classes.save(folder)
-    process = run_file.this_process(callbacks.command, report.code_version(), run.mesh)
-    run_file.add(folder, process)
-    configs.save(run.config, folder / CONFIG_FILE)
+    commit = report.code_version()
+    with callbacks.shield():
+        regular.check_tree(folder)  # where a link leads, nothing is written or deleted
+        for path in files.remove_partial(folder) + files.remove_partial(folder / checkpoint.FOLDER):
+            callbacks.on_note(f"removed {path}: half-written when the run was stopped")
+        if run.progress < 1.0:  # results there are of a former budget, which this run goes beyond
+            for name in (report.RESULTS_FILE, report.RESULTS_PAGE, report.EPISODES_FILE):
+                (folder / name).unlink(missing_ok=True)
+        configs.save(run.config, folder / CONFIG_FILE)
+        if run.config.word_vectors is not None and not (folder / WORD_VECTORS_FILE).exists():
+            task.vectors.save_copy(folder / WORD_VECTORS_FILE, task.tables.classes)
+        task.classes.save(folder)
+        run_file.add(folder, run_file.this_process(callbacks.command, commit, run.mesh))
 
 
 def _learn(

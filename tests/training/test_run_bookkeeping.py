@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ from tdanet_jax import config as configs
 from tdanet_jax.config import CONFIG_FILE, LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.evaluation import report as report_module
 from tdanet_jax.evaluation import rollout
+from tdanet_jax.io import files
 from tdanet_jax.scenes import SceneTables
 from tdanet_jax.task import Task, make_task
 from tdanet_jax.training.callbacks import Callbacks
@@ -28,6 +32,7 @@ from tdanet_jax.words import WordVectors
 from tdanet_jax.workflows.train import _check_longer as check_longer
 from tdanet_jax.workflows.train import _prepare as prepare
 from tdanet_jax.workflows.train import _report as evaluate_finished
+from tdanet_jax.workflows.train import resumed
 
 CONFIG = TrainConfig(
     minutes=10.0,
@@ -148,6 +153,41 @@ def test_results_of_a_former_budget_are_not_those_of_a_longer_run(
     assert [name for name in RESULTS if (tmp_path / name).exists()] == [
         name for name in RESULTS if steps == 10
     ]
+
+
+class Shielding(Callbacks):
+    """Knows whether a signal would have to wait."""
+
+    shielded = False
+
+    @contextlib.contextmanager
+    def shield(self) -> Iterator[None]:
+        self.shielded = True
+        yield
+        self.shielded = False
+
+
+@pytest.mark.parametrize("written", range(4))
+def test_a_start_that_is_cut_short_leaves_a_new_folder_or_a_run_to_resume(
+    task: Task, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
+) -> None:
+    """Killed after each of the files; only a kill can do so, as signals wait."""
+    run = Run(tmp_path, dataclasses.replace(CONFIG, word_vectors="there.txt"), task)
+    callbacks, replacing, writes = Shielding(), files.replacing, itertools.count()
+
+    def cut(path: Path) -> Any:
+        assert callbacks.shielded
+        if next(writes) == written:
+            raise KeyboardInterrupt
+        return replacing(path)
+
+    monkeypatch.setattr(files, "replacing", cut)
+    with pytest.raises(KeyboardInterrupt):
+        prepare(run, callbacks)
+    if written:
+        assert resumed(tmp_path) == run.config
+    else:
+        files.check_empty(tmp_path)
 
 
 def test_a_run_without_its_metrics_is_evaluated_all_the_same(
