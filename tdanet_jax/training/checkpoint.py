@@ -118,6 +118,10 @@ class Checkpoints:
           make_state: makes a state of the right shapes, given the `max_detections` of its meta, if
             there are any; only traced, never run.
 
+        Returns:
+          The state, all of it NumPy arrays, which alone can be laid out over several processes: its
+          key is `jax.random.key_data`. And its meta.
+
         Raises:
           ValueError: there is no checkpoint, or none that fits this configuration.
         """
@@ -129,8 +133,7 @@ class Checkpoints:
             blank = jax.eval_shape(_plain, jax.eval_shape(lambda: make_state(rows)))
             return _state(path, written, blank), meta
 
-        state, meta = self._read(read)
-        return state.replace(key=jax.random.wrap_key_data(state.key)), meta
+        return self._read(read)
 
     def snapshot(self) -> Snapshot:
         """The network of the newest checkpoint, without knowing anything else of the run.

@@ -109,7 +109,9 @@ class Run:
         # The last chunk was in these rooms. They are entered only if there is another.
         self._turn = self.pools.turn(max(0, self._saved - self.config.chunk_updates))
         self.pools.lengthen_frames(int(meta.get("max_detections", 0)))
-        return jax.device_put(state, self._layout)
+        state = jax.device_put(state, self._layout)
+        wrap = jax.jit(jax.random.wrap_key_data, out_shardings=self._shared)
+        return state.replace(key=wrap(state.key))
 
     def save(self) -> None:
         """Writes a checkpoint of the present state, unless there is one.

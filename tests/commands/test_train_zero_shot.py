@@ -177,23 +177,26 @@ def slurms_variables():
 @pytest.mark.slow
 @pytest.mark.parametrize("who_is_who", [own_variables, slurms_variables])
 def test_two_processes_train_together_and_one_goes_on_alone(who_is_who, ithor, tmp_path):
-    """The environments of one run in two processes; one process continues from what they saved.
+    """The environments of one run in two processes, which are stopped and go on; then one goes on.
 
     With odometry and triangulation: every environment has a map of its own.
     """
     out = tmp_path / "run"
-    arguments = ["--steps", "2400", "--devices", "2", *SENSES, *command.TINY, "--out", out]
-    variables = who_is_who()
-    both = [
-        command.start("train_zero_shot", *arguments, variables=variables(number))
-        for number in (0, 1)
-    ]
-    said = [process.communicate(timeout=600)[0] for process in both]
-    assert [process.returncode for process in both] == [0, 0]
-    assert "wrote" in said[0]
-    assert "steps/s" not in said[1]
-    rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
-    assert [row["steps"] for row in rows] == list(range(400, 2401, 400))
+    new = ["--devices", "2", *SENSES, *command.TINY, "--out", out]
+    for arguments, steps in ((new, 2400), (["--devices", "2", "--resume", out], 2800)):
+        variables = who_is_who()
+        both = [
+            command.start(
+                "train_zero_shot", *arguments, "--steps", str(steps), variables=variables(number)
+            )
+            for number in (0, 1)
+        ]
+        said = [process.communicate(timeout=600) for process in both]
+        assert [process.returncode for process in both] == [0, 0], said
+        assert "wrote" in said[0][0]
+        assert "steps/s" not in said[1][0]
+        rows = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+        assert [row["steps"] for row in rows] == list(range(400, steps + 1, 400))
 
     done = command.run("train_zero_shot", "--resume", out, "--steps", "3200")
     assert done.returncode == 0, done.stderr
