@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal
 
 from tdanet_jax import sense_noise
 from tdanet_jax.decisions import Decisions
@@ -16,6 +16,7 @@ from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import FileError, jsons, regular
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.registry import MODELS, SENSORS
+from tdanet_jax.settings import Settings
 from tdanet_jax.splits import OF_VALIDATION, OPEN, file_name, make_split, split_name
 from tdanet_jax.targets import PAPER as PAPER_TARGETS
 from tdanet_jax.targets import canonical, known_classes, naming
@@ -38,7 +39,7 @@ TRUST = "TDANET_TRUST"
 
 
 @dataclasses.dataclass(frozen=True)
-class LearnerConfig:
+class LearnerConfig(Settings):
     """The update's hyperparameters; `--preset paper` has those of the reference implementation."""
 
     num_envs: int = 64
@@ -101,7 +102,7 @@ class LearnerConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class NetworkConfig:
+class NetworkConfig(Settings):
     """The network, and what it is shown."""
 
     width: int = 512
@@ -172,7 +173,7 @@ class NetworkConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(Settings):
     """One training run."""
 
     split: str = "18/4"
@@ -243,10 +244,7 @@ class TrainConfig:
     def check(self) -> None:
         """Raises ValueError, with one line that names the flag, if a value is out of range."""
         for part in (self, self.learner, self.network):
-            for name, kind in get_type_hints(type(part)).items():
-                if not fits(value := getattr(part, name), kind):
-                    wanted = "finite" if isinstance(value, float) else f"of type {kind}"
-                    raise ValueError(f"--{name.replace('_', '-')} {value}: must be {wanted}")
+            part.check_types()
         check_seed(self.seed)
         if self.split == OPEN and self.targets != PAPER_TARGETS:
             raise ValueError(f"--targets {self.targets}: --split {OPEN} has its own targets")
@@ -428,19 +426,6 @@ def check_seed(seed: int) -> None:
     """Raises ValueError unless a seed is one of the 2^32 that give different keys."""
     if not 0 <= seed < 2**32:
         raise ValueError(f"--seed {seed}: must be between 0 and {2**32 - 1}")
-
-
-def fits(value: Any, kind: Any) -> bool:
-    """Whether a value is of a field's type; numbers must be finite."""
-    if get_origin(kind) is Literal:
-        return value in get_args(kind)
-    if get_origin(kind) is tuple:
-        return isinstance(value, tuple) and all(fits(one, get_args(kind)[0]) for one in value)
-    if get_args(kind):
-        return any(fits(value, one) for one in get_args(kind))
-    if kind is float:
-        return type(value) in (int, float) and abs(value) < 1e300
-    return isinstance(value, kind) and isinstance(value, bool) == (kind is bool)
 
 
 #: The hyperparameters of the reference implementation, in our environment and update.

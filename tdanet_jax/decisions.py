@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+from tdanet_jax.settings import Settings
+
 #: For each field of `Decisions`: whether a number can be its value, and how an error says it.
 _RANGES: dict[str, tuple[Callable[[float], bool], str]] = {
     "reach_threshold": (lambda value: 0 <= value < 1, "be at least 0 and below 1"),
@@ -15,7 +17,7 @@ _RANGES: dict[str, tuple[Callable[[float], bool], str]] = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Decisions:
+class Decisions(Settings):
     """How a trained network decides: settings of `NetworkConfig` on which training does not depend.
 
     None leaves the run's.
@@ -39,9 +41,10 @@ class Decisions:
 
     def check(self) -> None:
         """Raises ValueError, with one line that names the flag, if a value is out of range."""
+        self.check_types()
         for name, value in self.replaced.items():
             holds, wanted = _RANGES[name]
-            if not (type(value) in (int, float) and holds(value)):
+            if not holds(value):
                 raise ValueError(f"--{name.replace('_', '-')} {value}: must {wanted}")
 
 

@@ -8,15 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from tdanet_jax import sense_noise
-from tdanet_jax.config import TrainConfig, check_seed, find_word_vectors, fits, with_decisions
+from tdanet_jax.config import TrainConfig, check_seed, find_word_vectors, with_decisions
 from tdanet_jax.decisions import OWN_DECISIONS, Decisions
 from tdanet_jax.sense_noise import SenseNoise
+from tdanet_jax.settings import Settings, fits
 from tdanet_jax.splits import OF_VALIDATION, OPEN
 from tdanet_jax.targets import canonical, known_classes, naming, parse
 
 
 @dataclasses.dataclass(frozen=True)
-class EvalConfig:
+class EvalConfig(Settings):
     """Where an evaluation departs from the run's own task."""
 
     data: str | None = None

@@ -99,7 +99,7 @@ def test_flags_say_what_is_sensed_and_in_which_order(
 def test_a_configuration_is_refused_for_its_sensors(sensors: tuple[str, ...], flag: str) -> None:
     with pytest.raises(ValueError, match=f"^{flag}: "):
         TrainConfig(network=NetworkConfig(sensors=sensors)).check()
-    with pytest.raises(ValueError, match=r"^--sensors .*must be of type"):
+    with pytest.raises(ValueError, match=r"^--sensors .*must be a tuple of strings"):
         TrainConfig(network=NetworkConfig(sensors=list(sensors))).check()  # type: ignore[arg-type]
 
 

@@ -73,7 +73,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--resume full/file", "full/file/config.json: Not a directory"),
         ("--resume broken", "broken/config.json: not JSON (Expecting property name"),
         ("--resume binary", "binary/config.json: not UTF-8"),
-        ("--resume typed", "typed/config.json: --steps many: must be of type"),
+        ("--resume typed", "typed/config.json: --steps many: must be a whole number"),
         ("--tensorboard", "--log tensorboard needs tensorboardX: pip install"),
     ],
     "evaluate": [
