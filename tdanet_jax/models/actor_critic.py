@@ -15,6 +15,7 @@ from tdanet_jax.models.activation_cache import ACTIVATIONS
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import Linear
 from tdanet_jax.models.lstm import LSTM, Carry
+from tdanet_jax.models.operands import OPERANDS, rounded
 from tdanet_jax.models.reach import ReachEstimate, mask_done
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.sensors import suite
@@ -185,6 +186,26 @@ class ActorCritic(nn.Module):
 def prepare(model: ActorCritic, weights: Any, words: jax.Array) -> Any:
     """The table of classes of these weights, from word vectors [C, D]."""
     return model.apply({"params": weights}, words, method="prepare")
+
+
+def round_kernels(model: ActorCritic, weights: Any, words: jax.Array, least: int) -> Any:
+    """The parameters with the kernels that the network's layers would round at every step, rounded.
+
+    Args:
+      words: word vectors [C, D].
+      least: kernels of no more numbers stay as they are.
+    """
+
+    def step(module: ActorCritic, words: jax.Array, state: RecurrentState) -> None:
+        inputs = state.carry, module.blank(1), state.prev_action_probs, state.is_first
+        module(module.prepare(words), *inputs)
+
+    def ask(weights: Any, words: jax.Array) -> Any:
+        state = initial_state(model, weights, 1)
+        return nn.apply(step, model, mutable=[OPERANDS])({"params": weights}, words, state)[1]
+
+    found = jax.eval_shape(ask, weights, words).get(OPERANDS, {})
+    return rounded(weights, found, least)
 
 
 def initial_state(

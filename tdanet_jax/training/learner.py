@@ -30,7 +30,7 @@ from tdanet_jax.training import imitation
 from tdanet_jax.training.gae import advantages
 from tdanet_jax.vocabulary import NUM_ACTIONS
 
-#: Kernels with more weights than this are cast to the network's precision once per rollout.
+#: Kernels with more weights than this are rounded to their layer's precision once per rollout.
 SMALL = 2**16
 
 
@@ -187,12 +187,10 @@ def rollout(
     transition = scope(jax.vmap(dynamics.transition, (0, 0, None)))
     within_reach = scope(jax.vmap(lambda state: dynamics.would_succeed(state, params)))
     best_actions = scope(jax.vmap(lambda state: dynamics.best_actions(state, params)))
-    # Cast once per rollout what every step would cast: the kernels of the large products.
-    weights = jax.tree.map(
-        lambda x: x.astype(model.dtype) if x.ndim > 1 and x.size > SMALL else x, state.params
-    )
+    # Round once per rollout what every step would round: the kernels of the large products.
+    weights = actor_critic.round_kernels(model, state.params, words, SMALL)
     class_table = actor_critic.prepare(model, state.params, words)
-    rate, estimated = model.encoder.dropout, model.reach_threshold is not None
+    dropout, estimated = model.encoder.dropout, model.reach_threshold is not None
     batch, units = config.num_envs, model.encoder.dropout_units
     # The cache holds for the parameters that acted, and so for the first optimiser step alone.
     collections = (ACTIVATIONS,) if config.optimizer_steps == 1 else ()
@@ -200,7 +198,7 @@ def rollout(
     def act(state: TrainState, step_key: jax.Array) -> tuple[TrainState, Rollout]:
         action_key, dropout_key, reset_key = jax.random.split(step_key, 3)
         obs = observe(state.env_state, params)
-        mask = _dropout_mask(dropout_key, rate, (batch, units)) if rate else None
+        mask = _dropout_mask(dropout_key, dropout, (batch, units)) if dropout else None
         recurrent, out, kept = actor_critic.act(
             model, weights, class_table, state.recurrent, obs, mask, collections, training=True
         )
@@ -252,7 +250,7 @@ def rollout(
 
 
 def _dropout_mask(key: jax.Array, rate: float, shape: tuple[int, ...]) -> jax.Array:
-    """Units that dropout keeps; the rate is rounded to 1/256, for a quarter of the random bits."""
+    """Units that dropout keeps; the rate counts in 1/256, for a quarter of the random bits."""
     return jax.random.bits(key, shape, jnp.uint8) >= round(256 * rate)
 
 
@@ -311,7 +309,7 @@ def minibatches(experience: Experience, count: int) -> Experience:
     """`count` parts with a leading axis: part i has the environments i, i + count, ...
 
     Environments are interchangeable, so there is no need to shuffle them. If they are divided
-    between devices, so is every part.
+    between devices, so is every part (`devices.check_divides`).
     """
 
     def split(x: jax.Array, axis: int) -> jax.Array:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import linen as nn
 
 from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import dynamics
@@ -19,6 +20,7 @@ from tdanet_jax.env.reward import Parents
 from tdanet_jax.env.types import EnvParams
 from tdanet_jax.models import actor_critic
 from tdanet_jax.models.actor_critic import ActorCritic, Output
+from tdanet_jax.models.layers import Linear
 from tdanet_jax.models.lstm import Carry
 from tdanet_jax.models.tdanet import TDANetEncoder
 from tdanet_jax.observation_spec import ObservationSpec
@@ -476,6 +478,39 @@ def test_a_step_that_is_not_finite_is_left_out_and_the_others_are_taken() -> Non
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after.params))
     moved = jax.tree.map(lambda new, old: (new != old).any(), after.params, state.params)
     assert any(jax.tree.leaves(moved))
+
+
+class Mixed(TDANetEncoder):
+    """TDANet's encoder with a layer in float32 and one that is no `Linear`."""
+
+    def setup(self) -> None:
+        self.attention, self.linear3 = Linear(self.width), Linear(self.width)
+        self.linear1, self.linear2 = Linear(self.width, self.dtype), Linear(self.width, self.dtype)
+        self.linear4 = nn.Dense(self.width)
+
+
+def test_no_kernel_is_rounded_that_its_layer_would_not_round(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(learner, "SMALL", 0)
+    spec = SENSORS
+    model = ActorCritic(Mixed(width=12, dtype=jnp.bfloat16), 8, dtype=jnp.bfloat16, spec=spec)
+    params = TASKS[True][1]
+    state = begin(jax.random.key(1), CONFIG, model, WORDS, params)
+    state = state.replace(params=randomised(state.params, seed=2))
+    rounded = actor_critic.round_kernels(model, state.params, WORDS, learner.SMALL)
+    names = {
+        jax.tree_util.keystr(path, simple=True, separator="/")
+        for path, leaf in jax.tree.leaves_with_path(rounded)
+        if leaf.dtype == jnp.bfloat16
+    }
+    assert names == {f"{name}/kernel" for name in ("encoder/linear1", "encoder/linear2", "lstm")}
+    _, steps, _ = rollout(state, jax.random.key(3), CONFIG, model, WORDS, params)
+    obs = jax.vmap(dynamics.observe, (0, None))(state.env_state, params)
+    recurrent = state.recurrent
+    seen = (recurrent.carry, obs, recurrent.prev_action_probs, recurrent.is_first)
+    _, out = forward(state.params, *seen, model=model)
+    np.testing.assert_allclose(steps.value[0], out.value, rtol=1e-5)
 
 
 def test_only_large_kernels_are_rounded_while_acting() -> None:
