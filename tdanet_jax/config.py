@@ -110,8 +110,9 @@ class NetworkConfig(Settings):
     hidden: int = 512
     """Units of the LSTM."""
     dropout: float = 0.0
-    """Dropout rate of the Siamese difference in training. The paper's is 0.25, which changed only
-    the speed on validation."""
+    """Dropout rate in training, rounded to 1/256: of the Siamese difference, or after both
+    convolutions of an image. The reference code's is 0.25, which changed only the speed on
+    validation."""
     rows: Literal["class", "object"] = "object"
     """One detection per object, as in the paper, or one per class (the extent of its instances), as
     in the code of MJOLNIR and SSNet. Per object did better on validation."""
@@ -412,7 +413,11 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     (("size_noise",), lambda value: 0 <= value <= 2, "be between 0 and 2"),
     (("gamma", "gae_lambda"), lambda value: 0 <= value <= 1, "be between 0 and 1"),
     (("imitation_until",), lambda value: 0 < value <= 1, "be above 0 and at most 1"),
-    (("dropout",), lambda value: 0 <= value < 1, "be at least 0 and below 1"),
+    (
+        ("dropout",),
+        lambda value: value == 0 or 1 / 256 <= value <= 255 / 256,
+        "be 0, or from 1/256 to 255/256",
+    ),
 )  # fmt: skip
 
 

@@ -59,6 +59,11 @@ def test_paper_preset_has_the_reference_constants():
         (TrainConfig(learner=LearnerConfig(clip_coef=0.0)), "--clip-coef 0.0"),
         (TrainConfig(learner=LearnerConfig(gamma=1.5)), "--gamma 1.5"),
         (TrainConfig(network=NetworkConfig(dropout=1.0)), "--dropout 1.0"),
+        (
+            TrainConfig(network=NetworkConfig(dropout=0.003)),
+            "--dropout 0.003: must be 0, or from 1/256 to 255/256",
+        ),
+        (TrainConfig(network=NetworkConfig(dropout=0.999)), "--dropout 0.999: must be 0, or"),
         (TrainConfig(learner=LearnerConfig(learning_rate=float("nan"))), "--learning-rate nan"),
         (TrainConfig(network=NetworkConfig(odometry=1)), "--odometry 1"),
         (TrainConfig(network=NetworkConfig(odometry=True, triangulation=1)), "--triangulation 1"),

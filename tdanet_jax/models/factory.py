@@ -29,7 +29,9 @@ def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
         the model is not shown what a sensor needs, or a sensor cannot be made.
     """
     module, options = MODELS.get(config.model, (config.model, {}))
-    network = config.network
+    # Dropout draws bytes. What is kept must be scaled by the same rate that is dropped.
+    dropout = round(256 * config.network.dropout) / 256
+    network = dataclasses.replace(config.network, dropout=dropout)
     dtype = jnp.dtype(resolve_precision(network).precision)
     model = find_make("--model", config.model, module)(network, classes, dtype, **options)
     if not isinstance(model, ActorCritic):

@@ -46,7 +46,8 @@ class TDANetEncoder(Encoder):
 
     Attributes:
       width: H, units of every layer.
-      dropout: share of the absolute difference that is dropped in training; the paper's is 0.25.
+      dropout: share of the absolute difference that is dropped in training; 0.25 in the reference
+        code.
       target_attention: False replaces TA by the mean of the detections (the paper's Table IV).
       siamese: False replaces SA by the attended feature alone (Table IV). With neither, nothing
         would depend on the target, so its word vector is appended to the features.

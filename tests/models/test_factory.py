@@ -128,6 +128,19 @@ def test_every_named_model_learns_with_sensors(
     assert not np.array_equal(after, before)
 
 
+@pytest.mark.parametrize(
+    ("rate", "drawn"), [(0.25, 64), (0.1, 26), (1 / 256, 1), (0.996, 255), (0.0, 0)]
+)
+def test_dropout_is_scaled_by_the_rate_that_is_drawn(rate: float, drawn: int) -> None:
+    network = dataclasses.replace(SMALL.network, dropout=rate)
+    TrainConfig(network=network).check()
+    model = make_model(dataclasses.replace(SMALL, network=network), VOCABULARY)
+    assert model.encoder.dropout == drawn / 256
+    kept = learner._dropout_mask(jax.random.key(0), model.encoder.dropout, (2**16,))
+    bits = jax.random.bits(jax.random.key(0), (2**16,), jnp.uint8)
+    assert np.array_equal(kept, bits >= drawn)
+
+
 def test_a_custom_module_is_a_model(monkeypatch: pytest.MonkeyPatch) -> None:
     module: Any = types.ModuleType("my_lab.counts")
     module.make = lambda config, classes, dtype: ActorCritic(Counts(), hidden=config.hidden)
