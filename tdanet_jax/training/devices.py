@@ -63,9 +63,11 @@ def start() -> None:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # AssertionError: no such device
         chosen = os.environ.get(PLATFORMS)
-        where = f"{PLATFORMS}={chosen}: JAX finds no such device here" if chosen else "JAX"
+        what = "JAX cannot be started"
+        if chosen:
+            what = f"{PLATFORMS}={chosen}: JAX finds no such device here"
         reason = f" ({_first_line(error)})" if str(error) else ""
-        raise ValueError(f"{where}{reason}") from None
+        raise ValueError(f"{what}{reason}") from None
 
 
 def _first_line(error: Exception) -> str:
@@ -213,8 +215,13 @@ def split(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec(AXIS))
 
 
-def check_divides(environments: int, mesh: Mesh, flag: str = "num-envs") -> None:
-    """Raises ValueError unless environments can be divided evenly; says which numbers can be."""
+def check_divides(
+    environments: int, mesh: Mesh, flag: str = "num-envs", minibatches: int = 1
+) -> None:
+    """Raises ValueError unless the environments of every minibatch can be divided evenly.
+
+    The message says which numbers can be.
+    """
     size, rest = mesh.size, environments % mesh.size
     if rest:
         fewer, more = environments - rest, environments - rest + size
@@ -224,6 +231,11 @@ def check_divides(environments: int, mesh: Mesh, flag: str = "num-envs") -> None
             f"--{flag} {environments}: cannot be divided evenly over {size} devices; "
             f"{' or '.join(str(n) for n in (fewer, more) if n)} environments can be, or "
             f"{' or '.join(map(str, near))} devices"
+        )
+    if environments % (minibatches * size):
+        raise ValueError(
+            f"--{flag} {environments}: must be a multiple of {minibatches * size}, "
+            f"--num-minibatches {minibatches} times {size} devices"
         )
 
 
