@@ -86,7 +86,8 @@ class Command:
     """Flags for one model alone, in quotes: "savn: --num-envs 64 --learning-rate 1e-3"."""
     vmap_seeds: bool = False
     """Train the seeds of a split and model in one vmapped call; needs a budget in steps. For
-    accelerators: on a CPU it is slower than one seed after the other, unless networks are small."""
+    accelerators: on a CPU it is slower than one seed after the other, unless networks are small.
+    Seeds of savn and li are trained one by one all the same."""
     shard: str | None = None
     """I/N: train the I-th of N shares of the runs, I from 1, and write no report. The machines need
     not share a folder: afterwards, copy all runs into one and use --report-only
@@ -242,33 +243,44 @@ def train_all(
       The folders of runs that are left to other processes, which train them.
     """
     from tdanet_jax.models.classes import ClassVocabulary
-    from tdanet_jax.models.factory import make_model
+    from tdanet_jax.models.factory import check_trained, make_model
+    from tdanet_jax.models.shared.adaptation import AdaptiveActorCritic
     from tdanet_jax.training import devices
 
     cluster.leave()  # each share has runs of its own
     mesh = devices.connect(training.devices)
     devices.keep_compiled()
-    todo = []
+    todo, adaptive = [], set()
     # A clash, or a model that cannot be made, shows before anything trains.
     for asked in configs:
         folder = command.out / run_name(asked)
         config = sweep.settled(command.out, asked)
-        make_model(config, ClassVocabulary())
-        devices.check_divides(config.learner.num_envs, mesh)
-        if sweep.progress(folder, config) != "finished":
+        model, learner = make_model(config, ClassVocabulary()), config.learner
+        devices.check_divides(learner.num_envs, mesh, minibatches=learner.num_minibatches)
+        progress = sweep.progress(folder, config)
+        if progress == "new":
+            check_trained(config, model)
+        if progress != "finished":
             todo.append((config, folder))
+        if isinstance(model, AdaptiveActorCritic):
+            adaptive.add(config.model)
     console.print(f"{len(configs)} runs, {len(configs) - len(todo)} finished, {len(todo)} to train")
     left: list[Path] = []
     key = alike(command)
     for _, group in itertools.groupby(todo, lambda run: key(run[0])):
         members = [*group]
+        model_name, vmapped = members[0][0].model, command.vmap_seeds
+        if vmapped and model_name in adaptive:
+            # Together, they would compute an inner step for every action.
+            console.print(f"note: seeds of {model_name}, which adapts, are trained one by one")
+            vmapped = False
         while members := [
             (config, folder)
             for config, folder in members
             if folder not in left and sweep.progress(folder, config) != "finished"
         ]:
             try:
-                train_members(members, command.vmap_seeds, training.devices, typed)
+                train_members(members, vmapped, training.devices, typed)
                 break
             except BlockingIOError as held:
                 if held.filename not in [str(folder) for _, folder in members]:
@@ -281,7 +293,7 @@ def train_all(
 def train_members(
     members: Sequence[tuple[TrainConfig, Path]], together: bool, device_count: int, typed: str
 ) -> None:
-    """Trains one run, or the seeds of one split and model together.
+    """Trains runs one after another, or the seeds of one split and model together.
 
     Raises:
       BlockingIOError: another process trains one of them; the error names its folder.
@@ -292,10 +304,10 @@ def train_members(
         with stoppable(lambda: "every seed is saved", typed) as reports:
             train_together(members, reports)
         return
-    ((config, folder),) = members
-    resume = (folder / CONFIG_FILE).exists()
-    with stoppable(functools.partial(how_to_continue, folder, config), typed) as reports:
-        train(config, folder, resume=resume, device_count=device_count, callbacks=reports)
+    for config, folder in members:
+        resume = (folder / CONFIG_FILE).exists()
+        with stoppable(functools.partial(how_to_continue, folder, config), typed) as reports:
+            train(config, folder, resume=resume, device_count=device_count, callbacks=reports)
 
 
 @contextlib.contextmanager

@@ -55,6 +55,16 @@ def make_model(config: TrainConfig, classes: ClassVocabulary) -> ActorCritic:
     )
 
 
+def check_trained(config: TrainConfig, model: ActorCritic) -> None:
+    """Raises ValueError, with one line that names the flag, if a part would never be trained."""
+    steps = config.learner.rollout_steps
+    if isinstance(model, AdaptiveActorCritic) and steps <= model.interval:
+        raise ValueError(
+            f"--rollout-steps {steps}: must be above {model.interval} for {config.model}, which "
+            "learns to adapt from the steps that follow an inner step in the same rollout"
+        )
+
+
 def resolve_precision(config: NetworkConfig) -> NetworkConfig:
     """The configuration with `precision` "auto" replaced by what is fastest on this machine."""
     if config.precision != "auto":

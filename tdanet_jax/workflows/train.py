@@ -20,7 +20,7 @@ from tdanet_jax.evaluation import episodes, policies, report, rollout
 from tdanet_jax.evaluation.episodes import Episodes
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import regular
-from tdanet_jax.models.factory import unused_flags
+from tdanet_jax.models.factory import check_trained, unused_flags
 from tdanet_jax.scenes.dataset import idle_rooms
 from tdanet_jax.task import load_task, resolve
 from tdanet_jax.training import checkpoint, devices, run_file
@@ -76,10 +76,13 @@ def train(
         config.check()
         config = config.normalised()
     mesh = devices.connect(device_count)
-    devices.check_divides(config.learner.num_envs, mesh)
+    learner = config.learner
+    devices.check_divides(learner.num_envs, mesh, minibatches=learner.num_minibatches)
     devices.keep_compiled()
     task = load_task(_located(config, folder), callbacks.on_rooms)
     lists = episodes.load(task.tables, task.split, task.extras)  # errors show before training
+    if not resume:
+        check_trained(config, task.model)
     for flag in () if resume else unused_flags(config, task.classes):
         callbacks.on_note(f"note: {flag} changes nothing for {config.model}")
     if idle := idle_rooms(task.tables, task.split):

@@ -299,6 +299,35 @@ def test_a_sweep_continues_only_with_the_same_flags_of_each_model(tmp_path, caps
     assert "18-4-savn-seed0: trained with other values of --learning-rate" in said
 
 
+def test_seeds_of_a_model_that_adapts_are_trained_one_by_one(
+    tmp_path, monkeypatch, capsys, trained
+):
+    from tdanet_jax.workflows import train as workflow
+
+    groups, together = [], workflow.train_together
+
+    def train_together(members, reports):
+        groups.append([folder.name for _, folder in members])
+        together(members, reports)
+
+    monkeypatch.setattr(workflow, "train_together", train_together)
+    arguments = ["--models", "savn", "tdanet", "--seeds", "0", "1", "2", "--steps", "9"]
+    with files.locked(tmp_path / "18-4-savn-seed1"), pytest.raises(SystemExit):
+        sweep.main([*arguments, "--vmap-seeds", "--out", str(tmp_path)])
+    seeds = [f"18-4-tdanet-seed{seed}" for seed in (0, 1, 2)]
+    assert groups == [seeds]
+    assert trained == ["18-4-savn-seed0", "18-4-savn-seed2", *seeds]
+    said = capsys.readouterr().out
+    assert said.count("note: seeds of savn, which adapts, are trained one by one\n") == 1
+
+
+def test_a_model_that_would_never_be_trained_to_adapt_is_refused(tmp_path, capsys, trained):
+    with pytest.raises(SystemExit):
+        sweep.main(["--models", "savn", "--rollout-steps", "6", "--out", str(tmp_path)])
+    assert "error: --rollout-steps 6: must be above 6 for savn" in capsys.readouterr().err
+    assert trained == []
+
+
 def test_a_report_waits_for_one_in_another_process(tmp_path, monkeypatch):
     order, said, waiting = [], [], threading.Event()
     monkeypatch.setattr(sweep.console, "print", lambda text: (said.append(text), waiting.set()))

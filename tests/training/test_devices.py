@@ -89,6 +89,36 @@ def test_environments_that_cannot_be_divided_say_which_can(environments, count, 
     devices.check_divides(256, SimpleNamespace(size=8))
 
 
+def test_every_minibatch_must_be_divided():
+    mesh = SimpleNamespace(size=8)
+    devices.check_divides(48, mesh, minibatches=3)
+    message = "--num-envs 24: must be a multiple of 16, --num-minibatches 2 times 8 devices"
+    with pytest.raises(ValueError, match=message):
+        devices.check_divides(24, mesh, minibatches=2)
+
+
+def test_a_run_whose_minibatches_cannot_be_divided_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(devices, "connect", lambda count: SimpleNamespace(size=2))
+    config = TrainConfig(learner=LearnerConfig(num_envs=10, num_minibatches=10))
+    with pytest.raises(ValueError, match="--num-envs 10: must be a multiple of 20"):
+        training.train(config, tmp_path / "run", device_count=2)
+
+
+@pytest.mark.usefixtures("ithor")
+@pytest.mark.parametrize(
+    ("steps", "said"), [(6, "--rollout-steps 6: must be above 6 for li, "), (7, "begun")]
+)
+def test_a_network_that_never_learns_to_adapt_is_refused(tmp_path, monkeypatch, steps, said):
+    def begin(*arguments):
+        raise ValueError("begun")
+
+    monkeypatch.setattr(training, "Run", begin)
+    config = TrainConfig(model="li", learner=LearnerConfig(rollout_steps=steps))
+    with pytest.raises(ValueError, match=said):
+        training.train(config, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.usefixtures("ithor")
 def test_a_run_that_is_refused_leaves_nothing(tmp_path, monkeypatch):
     """Whether what it lacks is found before its folder is made, or after."""
@@ -115,7 +145,7 @@ def test_a_run_that_is_refused_leaves_nothing(tmp_path, monkeypatch):
     [
         ("cuda", AssertionError(), "JAX_PLATFORMS=cuda: JAX finds no such device here$"),
         ("gpu", RuntimeError("no rocm\nmore"), r"JAX_PLATFORMS=gpu: JAX .* here \(no rocm\)$"),
-        (None, RuntimeError("no cpu"), r"^JAX \(no cpu\)$"),
+        (None, RuntimeError("no cpu"), r"^JAX cannot be started \(no cpu\)$"),
     ],
 )
 def test_a_jax_that_cannot_be_started_is_one_clear_error(monkeypatch, platform, error, what):

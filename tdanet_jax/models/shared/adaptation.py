@@ -21,8 +21,9 @@ per-environment parameters.
 
 In training, all environments take their inner steps together, after every k steps of a rollout: an
 episode first adapts after the first such interval that lies within it, and no interval spans two
-rollouts. In tests all episodes begin together, and the inner steps come after 6, 12, 18 and 24
-steps, as published.
+rollouts. The gradient ends with the rollout: an inner step is trained by the later steps of its
+rollout alone, where the published code differentiates through whole episodes. In tests all episodes
+begin together, and the inner steps come after 6, 12, 18 and 24 steps, as published.
 """
 
 from __future__ import annotations
