@@ -30,8 +30,8 @@ OUT_OF_REACH = -1e9
 VISIBILITY_DISTANCE = 1.5  # metres, horizontal, within which an object can be visible
 FIELD_OF_VIEW = 90.0  # degrees, horizontal and vertical
 IMAGE_SIZE = 300  # pixels, width and height of a frame
-#: A class that is left out of all rooms: its box spans the room, and it hides nothing.
-IGNORED = "Floor"
+#: Classes that are left out of all rooms: their boxes span the room, and they hide nothing.
+IGNORED = frozenset({"Ceiling", "Floor", "Room"})
 
 ROOM_TYPES = ("kitchen", "living_room", "bedroom", "bathroom")
 

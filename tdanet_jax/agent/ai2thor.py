@@ -19,6 +19,7 @@ from tdanet_jax.agent.base import Decision
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.labels import Labels
 from tdanet_jax.poses import ITHOR, PoseGrid
+from tdanet_jax.scenes.visibility.rules import RULES
 from tdanet_jax.vocabulary import (
     ACTION_NAMES,
     FIELD_OF_VIEW,
@@ -47,7 +48,7 @@ def settings(grid: PoseGrid = ITHOR) -> dict[str, Any]:
 SETTINGS = settings()
 
 #: Object types that are parts of the building; the rooms in which agents are trained have none.
-STRUCTURE = frozenset({IGNORED, "Ceiling", "Door", "Doorframe", "Doorway", "Room", "Wall"})
+STRUCTURE = IGNORED | RULES.structure
 
 #: What AI2-THOR's LookUp and LookDown tilt the camera by, unless they are told.
 LOOK_DEGREES = 30

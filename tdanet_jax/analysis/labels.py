@@ -137,7 +137,7 @@ def of_plan(plan: FloorPlan, first: Collection[int], scale: float = 1.0) -> list
     """
     x1, z1, x2, z2 = plan.extent
     large = [i for i, outline in enumerate(plan.outlines) if floor_plan.area(outline) >= LEAST_AREA]
-    named = {IGNORED, *(plan.classes[i] for i in first)}
+    named = {*IGNORED, *(plan.classes[i] for i in first)}
     others = {name: i for i in large[::-1] if (name := plan.classes[i]) not in named}
     chosen, things = [*first, *sorted(others.values())], []
     for i in chosen:

@@ -65,7 +65,9 @@ def parse_scene(
     Raises:
       SceneError: a record or the points break a rule; it names scene, object and rule.
     """
-    objects = [parse_object(name, r) for r in records if _text(name, r, "objectType") != IGNORED]
+    objects = [
+        parse_object(name, r) for r in records if _text(name, r, "objectType") not in IGNORED
+    ]
     objects.sort(key=lambda item: (item.object_class, item.object_id))
     if not objects:
         raise SceneError(f"{name}: no objects")
@@ -133,7 +135,7 @@ def parse_object(scene: str, record: Mapping[str, Any]) -> SceneObject:
         openable=bool(record.get("openable")),
         is_open=bool(record.get("isOpen")),
         pickupable=bool(record.get("pickupable")),
-        parents=tuple(sorted(p for p in parents if p.split("|")[0] != IGNORED)),
+        parents=tuple(sorted(p for p in parents if p.split("|")[0] not in IGNORED)),
         visible=None if record.get("visible") is None else bool(record["visible"]),
     )
 

@@ -184,5 +184,5 @@ def test_robothor_objects_parse() -> None:
     spots = np.array([(0.0, 0.9, 0.0)])
     for i, records in enumerate(content):
         scene = metadata.parse_scene(f"RoboTHOR{i}", 1, records, spots)
-        kept = [r for r in records if r["objectType"] != IGNORED]
+        kept = [r for r in records if r["objectType"] not in IGNORED]
         assert len(scene.objects) == len(kept)

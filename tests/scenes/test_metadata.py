@@ -37,6 +37,8 @@ DOCUMENT: dict[str, Any] = {
             "isOpen": True,
             "rotation": {"x": 0, "y": 45, "z": 0},
         },
+        {"objectId": "room|0", "objectType": "Room", "axisAlignedBoundingBox": None},
+        {"objectId": "Ceiling|0", "objectType": "Ceiling", "axisAlignedBoundingBox": None},
     ],
     "agent": {
         "position": {"x": 0.1, "y": 0.9, "z": 0.0},

@@ -88,6 +88,7 @@ def _first_hit(
     enter, leave = _interval(origin, edges, camera, rays)
     first, axis = enter.max(axis=1), enter.argmax(axis=1)
     hit = (first < leave.min(axis=1)) & (first > 0)
+    hit &= item.object_class not in rules.structure
     if item.object_class in rules.fronts:
         hit &= np.isin(axis, [a for a, _ in fronts_of(item, scene.points, rules.nearly)])
         for front, side in fronts_of(item, scene.points, rules.nearly):

@@ -171,7 +171,7 @@ def _boxes_in_view(
       least: [P * O] area in view from which on an object counts as visible.
     """
     area, owners = patches.area[patch], patches.owner[patch]
-    place = position * (patches.place[-1] + 2) + patches.place[patch]
+    place = position * (patches.place.max(initial=0) + 2) + patches.place[patch]
     center, corner, eye = (a.astype(np.float32) for a in (patches.center, patches.corner, cameras))
     x, up, z = (center[patch, axis] - eye[position, axis] for axis in range(3))
     radius = np.abs(corner - center[:, None]).sum(axis=-1).max(initial=0) + 1

@@ -50,6 +50,11 @@ class Rules:
     # Inset: meshes do not fill their boxes; solids are smaller by this share on every side.
     inset: float = 0.05
 
+    # Structure: parts of the building, which hide things and are never detections. A wall is inset
+    # in its thickness alone. The box of a door that is not shut is a hole in the wall around it.
+    walls: frozenset[str] = _names("Wall")
+    doors: frozenset[str] = _names("Door Doorframe Doorway")
+
     # Closed: hide their contents. Toilets, sinks and bathtubs do not.
     closed: frozenset[str] = _names("Box Cabinet Drawer Fridge Microwave Safe")
 
@@ -57,9 +62,9 @@ class Rules:
     plates: frozenset[str] = _names("CoffeeTable Desk DiningTable SideTable")
     thickness: float = 0.05
 
-    # Frames: glass, cloth on rails, lattices, thin stands, hollow or rounded objects and sheets
-    # with holes; they occlude nothing.
-    frames: frozenset[str] = _names(
+    # See-through: glass, cloth on rails, lattices, thin stands, hollow or rounded objects and
+    # sheets with holes; they occlude nothing.
+    see_through: frozenset[str] = _names(
         "ArmChair Bathtub BathtubBasin Blinds Boots Chair CounterTop Curtains DeskLamp Faucet "
         "FloorLamp HandTowelHolder HousePlant Laptop Mirror Shelf ShelvingUnit ShowerCurtain "
         "ShowerDoor ShowerGlass ShowerHead Sink SinkBasin Stool StoveBurner StoveKnob TVStand "
@@ -69,6 +74,11 @@ class Rules:
     # Walls: nothing is seen across a void, an area of the floor plan this far from every reachable
     # point and every object.
     void: float = 0.5
+
+    @property
+    def structure(self) -> frozenset[str]:
+        """Classes that are parts of the building."""
+        return self.walls | self.doors
 
 
 RULES = Rules()

@@ -63,9 +63,12 @@ def patches_of(scene: Scene, rules: Rules) -> Patches:
     Raises:
       SceneError: there are more than the budget allows.
     """
-    parts = []
+    # With an empty part: there are rooms without any patch.
+    parts = [(0, np.zeros(3), 0, np.zeros(0, int), np.zeros((0, 4, 3)))]
     total = first = 0
     for index, item in enumerate(scene.objects):
+        if item.object_class in rules.structure:
+            continue
         origin, edges = box_frame(item.box, item.corners)
         lengths = np.sqrt((edges * edges).sum(axis=1))
         fine, coarse = np.minimum(lengths, 1.0), np.maximum(lengths - 1.0, 0.0)
@@ -128,21 +131,26 @@ def solids_of(scene: Scene, rules: Rules) -> Solids:
     aligned = [(box, OPEN) for box in void_boxes(scene, rules)]
     turned = []
     for item in scene.objects:
-        if item.object_class in rules.frames:
+        if item.object_class in rules.see_through or _is_passage(item, rules):
             continue
         closed = item.object_class in rules.closed and not item.is_open
         kind, inset = (CLOSED, 0.0) if closed else (OPEN, rules.inset)
         origin, edges = box_frame(item.box, item.corners)
         lengths = np.sqrt((edges * edges).sum(axis=1))
+        is_wall = item.object_class in rules.walls
         if item.object_class in rules.plates:
             box = item.box.copy()
             box[0, 1] = max(box[0, 1], box[1, 1] - rules.thickness)
             aligned.append((box, kind))
         elif np.sort(np.abs(edges))[:, 1].max() <= THIN:  # along the world's axes
+            if is_wall:
+                aligned += [(box, kind) for box in wall_boxes(item, scene, rules)]
+                continue
             rim = inset * (item.box[1] - item.box[0])
             aligned.append((item.box + np.stack([rim, -rim]), kind))
         else:
-            turned.append((origin + edges.sum(axis=0) / 2, edges, lengths, inset, kind))
+            insets = inset * (lengths == lengths.min()) if is_wall else inset
+            turned.append((origin + edges.sum(axis=0) / 2, edges, lengths, insets, kind))
     boxes = [box for box, _ in aligned]
     boxes += [np.stack([-lengths, lengths]) * (0.5 - inset) for _, _, lengths, inset, _ in turned]
     unit = unit_of(scene)
@@ -160,6 +168,48 @@ def solids_of(scene: Scene, rules: Rules) -> Solids:
         aligned=plain,
         unit=unit,
     )
+
+
+def _is_passage(item: SceneObject, rules: Rules) -> bool:
+    """Whether it is a doorway without a door, or with an open one."""
+    has_door = item.openable or item.object_class == "Door"
+    return item.object_class in rules.doors and (item.is_open or not has_door)
+
+
+def wall_boxes(wall: SceneObject, scene: Scene, rules: Rules) -> list[np.ndarray]:
+    """Boxes [2, 3] of a wall along x or z, without the passages through its middle.
+
+    Nor is there a wall around the points in its box, as in a doorway that is not among the objects.
+    """
+    size = wall.box[1] - wall.box[0]
+    across = 0 if size[0] <= size[2] else 2
+    middle, along = wall.box[:, across].mean(), 2 - across
+    rim = rules.inset * size * (np.arange(3) == across)
+    holes = [
+        (*item.box[:, along], item.box[1, 1])
+        for item in scene.objects
+        if _is_passage(item, rules)
+        and item.box[0, across] - THIN <= middle <= item.box[1, across] + THIN
+    ]
+    at = scene.points
+    inside = ((wall.box[0] <= at) & (at <= wall.box[1]))[:, [0, 2]].all(axis=1)
+    holes += [(x - rules.standing, x + rules.standing, np.inf) for x in at[inside, along]]
+    boxes = [wall.box + np.stack([rim, -rim])]
+    for hole in holes:
+        boxes = [piece for box in boxes for piece in _around_hole(box, along, *hole)]
+    return boxes
+
+
+def _around_hole(
+    box: np.ndarray, along: int, low: float, high: float, top: float
+) -> list[np.ndarray]:
+    """A box without what is between `low` and `high` along an axis, and below `top`."""
+    before, beyond, above = box.copy(), box.copy(), box.copy()
+    before[1, along] = min(low, box[1, along])
+    beyond[0, along] = max(high, box[0, along])
+    above[:, along] = np.clip((low, high), *box[:, along])
+    above[0, 1] = max(top, box[0, 1])
+    return [piece for piece in (before, beyond, above) if (piece[0] < piece[1])[[1, along]].all()]
 
 
 def unit_of(scene: Scene) -> int:
