@@ -419,7 +419,7 @@ def _parents(
     extras: Extras | None,
 ) -> Parents:
     """Those that came with the rooms, else those found in the training rooms."""
-    if extras is not None and extras.parents:
+    if extras is not None and extras.has_parents:
         return reward.published_parents(seen_rooms, targets, extras.parents, hidden)
     return reward.find_parents(seen_rooms, targets)
 

@@ -18,13 +18,24 @@ from tdanet_jax.env import dynamics
 from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.factory import make_model, unused_flags
 from tdanet_jax.registry import MODELS
+from tdanet_jax.scenes.dataset import Extras
 from tdanet_jax.scenes.offline.features import features_path
 from tdanet_jax.scenes.tables import SceneTables
 from tdanet_jax.splits import make_split
 from tdanet_jax.task import Task, make_task, resolve
 from tdanet_jax.words import WordVectors
+from tests.support.handmade import Room, corridor, tables_of
 
 SMALL = NetworkConfig(width=8, hidden=4, precision="float32")
+
+
+@pytest.mark.parametrize("published", [{}, {"kitchen": {}}, {"kitchen": {"Mug": {}}}])
+def test_parents_are_estimated_where_data_name_none(published: dict) -> None:
+    things = [("Mug", (0.0, 0.5, 0.0)), ("Sink", (0.1, 0.5, 0.0))]
+    tables = tables_of([Room("kitchen", corridor(1), things, {})], ["Mug", "Sink"], ["Mug"])
+    extras = Extras(parents=published)
+    found = task_module._parents(tables, {"kitchen": ["Mug"]}, (), extras)
+    assert found.classes.tolist() == [[1, -1, -1]]
 
 
 def rooms(tables: SceneTables) -> SceneTables:

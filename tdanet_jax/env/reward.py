@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tdanet_jax.splits import make_split
-
 if TYPE_CHECKING:
     from tdanet_jax.scenes.tables import SceneTables
+    from tdanet_jax.splits import Split
 
 #: Reward of any step that earns nothing else, a failed Done included.
 STEP_REWARD = -0.01
@@ -105,30 +104,26 @@ def find_parents(tables: SceneTables, targets: Mapping[str, Sequence[str]]) -> P
     return Parents(classes, reward)
 
 
-def named_parents(tables: SceneTables) -> dict[str, dict[str, dict[str, float]]]:
-    """The parents of all 22 targets in the training rooms: room type -> target -> parent -> R_p."""
-    split = make_split("22/0")
+def named_parents(tables: SceneTables, split: Split) -> dict[str, dict[str, dict[str, float]]]:
+    """The parents of a split's targets in its training rooms: room type -> target -> parent -> R_p.
+
+    Targets without parents are left out.
+    """
     scenes = [name for name in split.train_scenes if name in tables.scenes]
     targets = {
         room: tuple(name for name in names if name in tables.targets)
         for room, names in split.seen.items()
     }
     found = find_parents(tables.subset(scenes), targets)
-    return {
-        room: {
-            target: {
-                tables.classes[c]: float(reward)
-                for c, reward in zip(
-                    found.classes[tables.targets.index(target)],
-                    found.reward[tables.targets.index(target)],
-                    strict=True,
-                )
-                if c >= 0
-            }
-            for target in names
-        }
-        for room, names in targets.items()
-    }
+    named: dict[str, dict[str, dict[str, float]]] = {}
+    for room, names in targets.items():
+        for target in names:
+            goal = tables.targets.index(target)
+            for c, reward in zip(found.classes[goal], found.reward[goal], strict=True):
+                if c >= 0:
+                    parents = named.setdefault(room, {}).setdefault(target, {})
+                    parents[tables.classes[c]] = float(reward)
+    return named
 
 
 def published_parents(

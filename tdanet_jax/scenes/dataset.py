@@ -74,6 +74,11 @@ class Extras:
     targets: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     made: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
 
+    @property
+    def has_parents(self) -> bool:
+        """Whether any target has a parent."""
+        return any(names for targets in self.parents.values() for names in targets.values())
+
     def class_graph(self, classes: Sequence[str]) -> np.ndarray | None:
         """The class graph between `classes`: [C, C] float32, or None without one.
 

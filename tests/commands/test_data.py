@@ -18,10 +18,10 @@ import tdanet_jax
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.commands import evaluate, scenes, train_zero_shot
 from tdanet_jax.io import files
-from tdanet_jax.scenes import SceneTables, dataset
+from tdanet_jax.scenes import SceneTables, dataset, tabulation
 from tdanet_jax.scenes.offline import features, importer
 from tests.conftest import SOME_ROOMS
-from tests.support import original
+from tests.support import original, toy
 from tests.support.command import TINY
 
 
@@ -127,6 +127,25 @@ def test_rooms_of_any_name_and_frame(
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.parametrize("part", ["train", "test"])
+def test_exported_rooms_have_the_parents_of_those_that_train(
+    part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever their names; without training rooms, there are no parents and no file of them."""
+    monkeypatch.chdir(tmp_path)
+    mug, sink = (toy.thing(name, (0.0, toy.CAMERA, 1.2)) for name in ("Mug", "Sink"))
+    tables = tabulation.build([toy.room(toy.line(2), mug, sink, name="Lab")])
+    dataset.save_rooms(
+        dataset.Rooms(tables, dataset.Extras(parts={"Lab": part})), Path("rooms.npz")
+    )
+    scenes.main(["export", "--data", "rooms.npz", "--out", "out"])
+    file = Path("out/c2p_prob.json")
+    if part == "test":
+        assert not file.exists()
+    else:
+        assert json.loads(file.read_text()) == {"Kitchen": {"Mug": {"Sink": 0.5}}}
+
+
 def write_features(place: Path) -> None:
     """Feature maps of a scene of the miniature, all ones."""
     h5py = pytest.importorskip("h5py")
@@ -219,6 +238,7 @@ def test_wrong_arguments_give_one_line_and_write_nothing(
     (tmp_path / "taken").mkdir()
     (source / "FloorPlan21_physics" / "graph.json").write_text('{"nodes": [], "links": [{}]}')
     (tmp_path / "own.json").write_text("{}")
+    (tmp_path / "old.features.npy").write_bytes(b"of earlier rooms")
     before = sorted(tmp_path.rglob("*"))
     for command, arguments, reason in (
         (scenes, ["import"], "a scene file, or --from a folder"),
@@ -233,6 +253,7 @@ def test_wrong_arguments_give_one_line_and_write_nothing(
         (scenes, ["import", "--from", "nowhere"], "nowhere: no folder"),
         (scenes, ["import", "--from", "original", "--out", "taken"], "--out taken: exists"),
         (scenes, ["import", "--from", "original", "--out", "no/a.npz"], "no such folder"),
+        (scenes, ["import", "own.json", "--out", "old.npz"], "--out old.features.npy: exists"),
         (scenes, ["export", "--out", "taken"], "--out taken: exists"),
         (scenes, ["export", "--out", "a", "--scenes", "FloorPlan0"], "FloorPlan0: no such scene"),
         (scenes, ["export", "--out", "a", "--data", "own.json"], "own.json: a scene file"),

@@ -46,6 +46,7 @@ class Export:
         """Writes the folder."""
         from tdanet_jax import words
         from tdanet_jax.env.reward import named_parents
+        from tdanet_jax.scenes.dataset import assign_rooms
         from tdanet_jax.scenes.offline import exporter
 
         if self.word_vectors is not None and not self.vectors:
@@ -54,7 +55,10 @@ class Export:
         remove_abandoned(self.out)
         rooms = load_rooms(self.data)
         tables, extras = rooms.tables, rooms.extras
-        parents = extras.parents if extras and extras.parents else named_parents(tables)
+        if extras is not None and extras.has_parents:
+            parents = extras.parents
+        else:
+            parents = named_parents(tables, assign_rooms(make_split("22/0"), rooms))
         if self.scenes:
             tables = tables.subset(self.scenes)
         exporter.check_layout(tables)

@@ -60,8 +60,8 @@ class Import:
         check_new_file(self.out)
         kinds, frame = self._kinds(), self._frame()
         maps, maps_out = None, features.features_path(self.out)
+        check_new_file(maps_out)  # or else the new rooms would take them for theirs
         if self.features and self.source is not None:
-            check_new_file(maps_out)
             maps = features.find_features(self.source, kinds)
         remove_abandoned(self.out, maps_out)
         rooms = self._rooms(kinds, frame)

@@ -61,12 +61,15 @@ def find_root(folder: Path) -> Path:
     """The folder whose children are the scenes: `folder`, or one up to two levels inside it.
 
     Raises:
-      FileError: there is none.
+      FileError: there is none, or there are several at the same level.
     """
     for pattern in ("*", "*/*", "*/*/*"):
-        for place in sorted(folder.glob(pattern)):
-            if _is_scene(place):
-                return place.parent
+        roots = sorted({place.parent for place in folder.glob(pattern) if _is_scene(place)})
+        if len(roots) > 1:
+            listed = ", ".join(str(root.relative_to(folder)) for root in roots)
+            raise FileError(folder, f"rooms in several folders; import one of them: {listed}")
+        if roots:
+            return roots[0]
     raise FileError(folder, f"no folder, or no folders of rooms (with a {GRID_FILE}) in it")
 
 

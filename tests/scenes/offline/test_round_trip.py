@@ -234,7 +234,7 @@ def test_nothing_is_written_outside_of_the_folder(
 def test_parents_survive_export_and_import(ithor: SceneTables) -> None:
     split = make_split("22/0")
     train = ithor.subset(split.train_scenes)
-    ours, theirs = find_parents(train, TARGETS), named_parents(ithor)
+    ours, theirs = find_parents(train, TARGETS), named_parents(ithor, split)
     back = published_parents(train, TARGETS, theirs, ())
     np.testing.assert_array_equal(np.sort(ours.reward), np.sort(back.reward))
     for goal in range(len(ithor.targets)):
@@ -376,6 +376,13 @@ def test_folders_without_scenes(tmp_path: Path) -> None:
     (tmp_path / "FloorPlan501").mkdir()
     with pytest.raises(FileError, match="no folders of rooms"):
         layout.find_root(tmp_path)
+    original.write_room(tmp_path / "a" / "test" / "FloorPlan21")
+    original.write_room(tmp_path / "a" / "train" / "FloorPlan1")
+    with pytest.raises(FileError, match=r"a: rooms in several .* one of them: test, train"):
+        layout.find_root(tmp_path / "a")
+    with pytest.raises(FileError, match="one of them: a/test, a/train"):
+        layout.find_root(tmp_path)
+    assert layout.find_root(tmp_path / "a" / "train") == tmp_path / "a" / "train"
     original.write_room(tmp_path / "a" / "Lab")
     with pytest.raises(FileError, match="no room to import; Lab: left out, --room-type or --rooms"):
         layout.find_scenes(layout.find_root(tmp_path))
