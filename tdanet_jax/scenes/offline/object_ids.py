@@ -11,6 +11,8 @@ from tdanet_jax.scenes.metadata import FARTHEST
 #: The box in metres of an object whose place is unknown.
 UNKNOWN = np.full((2, 3), np.nan)
 
+#: A coordinate in metres. Other numbers are part of a name, as in ProcTHOR's "Sofa|3|0|1".
+_METRES = re.compile(r"[+-]\d+\.\d+")
 _ID = re.compile(r"[^|\s]+(\|[^|]+)+")
 
 
@@ -32,10 +34,10 @@ def class_of(name: str) -> str:
 
 def place_in(name: str) -> np.ndarray:
     """The place in an object's id, as a box [2, 3] without extent, in metres; NaN without one."""
-    try:
-        place = np.array([float(part) for part in name.split("|")[1:4]])
-    except ValueError:
+    parts = name.split("|")[1:4]
+    if len(parts) != 3 or not all(_METRES.fullmatch(part) for part in parts):
         return UNKNOWN
-    if place.shape != (3,) or not (np.abs(place) <= FARTHEST).all():
+    place = np.array([*map(float, parts)])
+    if not (np.abs(place) <= FARTHEST).all():
         return UNKNOWN
     return np.stack([place, place])

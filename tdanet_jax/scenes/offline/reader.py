@@ -22,7 +22,7 @@ from tdanet_jax.scenes.offline.object_ids import UNKNOWN, class_of, is_id, place
 from tdanet_jax.scenes.scene import MOST_OBJECTS, MOST_POINTS, SUBPIXEL, Scene, SceneError
 from tdanet_jax.scenes.visibility.build import Detections
 from tdanet_jax.scenes.visibility.geometry import transitions
-from tdanet_jax.vocabulary import IMAGE_SIZE
+from tdanet_jax.vocabulary import IGNORED, IMAGE_SIZE
 
 #: Pixels by which a box may leave the frame, to which it is then clipped.
 OVERHANG = 1.0
@@ -199,6 +199,8 @@ def read_visibility(path: Path, grid: Grid) -> Objects:
     objects = Objects()
     for name, value in jsons.members(path):
         if isinstance(value, list):
+            if class_of(name) in IGNORED:
+                continue
             objects.add(path, name, class_of(name), place_in(name))
             objects.states[name] |= {grid.state(path, key) for key in value}
         elif isinstance(value, Mapping) and isinstance(value.get("objects"), list):
@@ -218,10 +220,28 @@ def _add_record(path: Path, key: str, objects: Objects, record: Any, state: int)
     named = name and object_class and isinstance(visible, bool)
     if not named or not isinstance(name, str) or not isinstance(object_class, str):
         raise FileError(path, f"{key}: an object without objectId, objectType or visible")
+    if object_class in IGNORED:
+        return
     if name not in objects.classes:
-        objects.add(path, name, object_class, place_in(name))
+        objects.add(path, name, object_class, _event_box(path, name, fields))
     if visible:
         objects.states[name].add(state)
+
+
+def _event_box(path: Path, name: str, record: Mapping[str, Any]) -> np.ndarray:
+    """An object's box [2, 3] in metres in an event, or else the place in its id."""
+    box = record.get("axisAlignedBoundingBox")
+    if box is None:
+        return place_in(name)
+    vectors = []
+    for part in ("center", "size"):
+        vector = box.get(part) if isinstance(box, Mapping) else None
+        if not isinstance(vector, Mapping):
+            raise FileError(path, f"{name}: axisAlignedBoundingBox has no center and size")
+        numbers = [jsons.number(path, vector.get(a), f"{name}: {a}", FARTHEST) for a in "xyz"]
+        vectors.append(np.array(numbers))
+    center, half = vectors[0], vectors[1] / 2
+    return np.stack([center - half, center + half])
 
 
 def read_objects(path: Path, grid: Grid, objects: Objects) -> dict[int, list[str]]:
@@ -239,17 +259,20 @@ def read_objects(path: Path, grid: Grid, objects: Objects) -> dict[int, list[str
     if not isinstance(records, Mapping) or not isinstance(instances, Mapping):
         raise FileError(path, "no objects and instances")
     names = list(records)
+    kept = set()
     for name, record in records.items():
         if not isinstance(record, Mapping) or not isinstance(record.get("objectType"), str):
             raise FileError(path, f"{name}: no objectType")
-        objects.add(path, name, record["objectType"], _extent(path, name, record))
+        if record["objectType"] not in IGNORED:
+            kept.add(name)
+            objects.add(path, name, record["objectType"], _extent(path, name, record))
     owners = {}
     for key, indices in instances.items():
         if not isinstance(indices, list) or not all(
             type(i) is int and 0 <= i < len(names) for i in indices
         ):
             raise FileError(path, f"{key}: not indices in the list of objects")
-        owners[grid.state(path, key)] = [names[i] for i in indices]
+        owners[grid.state(path, key)] = [names[i] for i in indices if names[i] in kept]
     return owners
 
 
@@ -284,7 +307,14 @@ def read_boxes(
                 raise FileError(path, f"{key}: {name!r} is neither a class nor an object's id")
             if is_id(name) != is_id(first):
                 raise FileError(path, f"{key}: both classes and ids of objects: {first}, {name}")
-        yield state, {name: _boxes(path, key, name, flat, frame) for name, flat in groups.items()}
+        yield (
+            state,
+            {
+                name: _boxes(path, key, name, flat, frame)
+                for name, flat in groups.items()
+                if (class_of(name) if is_id(name) else name) not in IGNORED
+            },
+        )
 
 
 def _boxes(path: Path, key: str, name: str, flat: Any, frame: Frame) -> np.ndarray:

@@ -27,5 +27,6 @@ def test_what_is_no_id(name: str) -> None:
 def test_places_in_ids() -> None:
     place = object_ids.place_in("Sink|+00.10|+00.93|-01.20|SinkBasin")
     assert place.tolist() == [[0.10, 0.93, -1.20]] * 2
-    for name in ("Cabinet|1|2", "Apple|a|b|c", "Mug|1|2|1e9", "Mug|nan|0|0"):
+    for name in ("Cabinet|1|2", "Apple|a|b|c", "Mug|1|2|1e9", "Mug|nan|0|0",
+                 "Sofa|3|0|1", "Mug|00.10|00.93|01.20", "Mug|+0.1|+0.9|-9999.0"):  # fmt: skip
         assert np.isnan(object_ids.place_in(name)).all()

@@ -145,6 +145,53 @@ def test_raw_metadata_in_place_of_the_map(folder: Path) -> None:
     assert "metadata.json (3 objects)" in after.found
 
 
+def test_boxes_of_events_say_where_objects_are(folder: Path) -> None:
+    (folder / "visible_object_map.json").unlink()
+    box = {"center": {"x": 1.0, "y": 0.5, "z": 2.0}, "size": {"x": 0.5, "y": 1.0, "z": 2.0}}
+    for given, expected in (
+        (box, [[0.75, 0.0, 1.0], [1.25, 1.0, 3.0]]),
+        (None, [[0.0, 1.0, 1.5]] * 2),
+        ([], "has no center and size"),
+        ({"center": box["center"]}, "has no center and size"),
+        ({**box, "size": {"x": 0.5}}, "y is not a number"),
+    ):
+        record = {"objectId": MUG, "objectType": "Mug", "visible": True}
+        event = {"objects": [{**record, "axisAlignedBoundingBox": given}]}
+        (folder / "metadata.json").write_text(json.dumps({KEYS[0]: event}))
+        if isinstance(expected, str):
+            with pytest.raises(FileError, match=rf"metadata\.json: .*{expected}"):
+                read(folder)
+        else:
+            [mug] = [item for item in read(folder).scene.objects if item.object_id == MUG]
+            assert mug.box.tolist() == expected
+
+
+def test_floors_are_left_out_of_every_file(folder: Path) -> None:
+    before = read(folder)
+    floor = "Floor|+00.00|+00.00|+00.00"
+    change(folder, "visible_object_map.json", lambda seen: seen.update({floor: KEYS}))
+    change(folder, "objects_bb.json", lambda boxes: boxes[KEYS[0]].update(Floor=[0, 200, 300, 300]))
+    assert rows(read(folder)) == rows(before)
+    named = {KEYS[0]: {floor: [0, 200, 300, 300], MUG: [1, 1, 2, 2]}}
+    change(folder, "objects_bb.json", lambda _: named)
+    assert [item for _, item, _, _ in rows(read(folder)) if "Floor" in item] == []
+    change(folder, "objects_bb.json", lambda _: {KEYS[0]: {"Floor": [0] * 4, "Mug": [1, 1, 2, 2]}})
+    records = {
+        floor: {"objectType": "Floor", "box": None}, MUG: {"objectType": "Mug", "box": None}
+    }  # fmt: skip
+    ours = {"objects": records, "instances": {KEYS[0]: [0, 1]}}
+    (folder / "objects.json").write_text(json.dumps(ours))
+    assert (0, MUG, (1, 1, 2, 2), False) in rows(read(folder))
+    (folder / "objects.json").unlink()
+    (folder / "visible_object_map.json").unlink()
+    things = [
+        {"objectId": name, "objectType": name.split("|")[0], "visible": True}
+        for name in (floor, MUG)
+    ]
+    (folder / "metadata.json").write_text(json.dumps({KEYS[0]: {"objects": things}}))
+    assert [item for _, item, _, _ in rows(read(folder)) if "Floor" in item] == []
+
+
 def test_the_file_named_with_the_distance_is_preferred(folder: Path) -> None:
     (folder / "visible_object_map_1.5.json").write_text(json.dumps({MUG: []}))
     assert "visible_object_map_1.5.json (1 objects)" in read(folder).found
