@@ -48,6 +48,10 @@ from tdanet_jax.splits import in_order, is_plain, known_type
 from tdanet_jax.vocabulary import IGNORED
 
 ALIGNED = 0.02  # metres by which a point may miss the grid
+SKEW = 0.02  # metres by which corners may miss those of a box
+APART = 0.5  # metres by which the middle of an oriented box may be outside of the aligned one
+#: Corners of an oriented box in AI2-THOR's order, as multiples of its edges.
+CORNERS = np.array([(x, y, z) for y in (0, 1) for x, z in ((0, 0), (1, 0), (1, 1), (0, 1))])
 FARTHEST = 1000.0  # metres from the origin; a coordinate beyond this is an error
 
 
@@ -119,7 +123,7 @@ def parse_object(scene: str, record: Mapping[str, Any]) -> SceneObject:
     half = _vector(scene, name, box, "size") / 2
     if (half < 0).any():
         raise SceneError(f"{scene}: {name}: box has a negative size")
-    oriented = record.get("objectOrientedBoundingBox")
+    aligned = np.stack([center - half, center + half])
     rotation = np.zeros(3)
     if record.get("rotation") is not None:
         rotation = _vector(scene, name, record, "rotation")
@@ -129,8 +133,8 @@ def parse_object(scene: str, record: Mapping[str, Any]) -> SceneObject:
     return SceneObject(
         object_id=name,
         object_class=_text(scene, record, "objectType"),
-        box=np.stack([center - half, center + half]),
-        corners=_corners(scene, name, oriented) if oriented else None,
+        box=aligned,
+        corners=_corners(scene, name, record.get("objectOrientedBoundingBox"), aligned),
         rotation=(float(rotation[0]), float(rotation[1]), float(rotation[2])),
         openable=bool(record.get("openable")),
         is_open=bool(record.get("isOpen")),
@@ -160,9 +164,11 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= FARTHEST
 
 
-def _corners(scene: str, name: str, oriented: Any) -> np.ndarray:
-    """Corners [8, 3] of an oriented box, in AI2-THOR's order."""
-    points = oriented.get("cornerPoints") if isinstance(oriented, Mapping) else None
+def _corners(scene: str, name: str, oriented: Any, aligned: np.ndarray) -> np.ndarray | None:
+    """Corners [8, 3] of an oriented box, in AI2-THOR's order; None if it is not known."""
+    points = oriented.get("cornerPoints") if isinstance(oriented, Mapping) else oriented
+    if points is None or points == []:
+        return None
     if (
         not isinstance(points, Sequence)
         or len(points) != 8
@@ -170,7 +176,20 @@ def _corners(scene: str, name: str, oriented: Any) -> np.ndarray:
         or not all(_is_number(value) for point in points for value in point)
     ):
         raise SceneError(f"{scene}: {name}: objectOrientedBoundingBox needs 8 finite cornerPoints")
-    return np.array(points, np.float64)
+    corners = np.array(points, np.float64)
+    edges = corners[[1, 4, 3]] - corners[0]
+    lengths = np.maximum(np.sqrt((edges * edges).sum(axis=1)), SKEW)
+    off = np.abs(corners - corners[0] - CORNERS @ edges).max()
+    slip = np.abs(np.triu(edges @ edges.T, 1) / np.maximum(lengths[:, None], lengths)).max()
+    if max(off, slip) > SKEW:
+        raise SceneError(
+            f"{scene}: {name}: cornerPoints are no box in AI2-THOR's order: around the bottom face, "
+            "then above each of these"
+        )
+    middle = corners.mean(axis=0)
+    if np.maximum(aligned[0] - middle, middle - aligned[1]).max() > APART:
+        raise SceneError(f"{scene}: {name}: cornerPoints are over {APART} m from its aligned box")
+    return corners
 
 
 def read_scenes(path: Path | str, kinds: Kinds | None = None) -> list[Scene]:

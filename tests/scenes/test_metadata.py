@@ -164,6 +164,16 @@ def broken(path: list[Any], value: Any) -> Any:
     return document
 
 
+def corners(
+    degrees: float = 0, low: float = 1.4, order: Any = range(8), skew: float = 0, away: float = 0
+) -> dict[str, Any]:
+    """The oriented box of the mug, or one with something wrong."""
+    turn = np.exp(1j * np.radians(degrees))
+    flat = [turn * (0.1 * x + 0.1j * z) for x, z in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    points = [[p.real + away + skew * (y > 1.5), y, p.imag + 1.0] for y in (low, 1.6) for p in flat]
+    return {"cornerPoints": [points[i] for i in order]}
+
+
 NAN = float("nan")
 CASES = [
     (["reachable_positions"], [], "Lab: no reachable position"),
@@ -182,6 +192,17 @@ CASES = [
     (["objects", 0, "axisAlignedBoundingBox", "size"], [1, 1, 1], r"Lab: Mug\|1: size is not"),
     (["objects", 0, "objectOrientedBoundingBox"], {}, None),
     (["objects", 0, "objectOrientedBoundingBox"], {"cornerPoints": [[0, 0, 0]]}, "8 finite"),
+    (["objects", 0, "objectOrientedBoundingBox"], {"cornerPoints": []}, None),
+    (["objects", 0, "objectOrientedBoundingBox"], {"cornerPoints": None}, None),
+    (["objects", 0, "objectOrientedBoundingBox"], corners(), None),
+    (["objects", 0, "objectOrientedBoundingBox"], corners(degrees=30), None),
+    (["objects", 0, "objectOrientedBoundingBox"], corners(low=1.6), None),  # flat
+    (["objects", 0, "objectOrientedBoundingBox"], corners(order=(4, 5, 6, 7, 0, 1, 2, 3)), None),
+    (["objects", 0, "objectOrientedBoundingBox"], corners(order=(0, 1, 3, 2, 4, 5, 7, 6)), "order"),
+    (["objects", 0, "objectOrientedBoundingBox"], corners(order=(0, 4, 1, 5, 3, 7, 2, 6)), "order"),
+    (["objects", 0, "objectOrientedBoundingBox"], corners(skew=0.1), "no box in AI2-THOR's order"),
+    (["objects", 0, "objectOrientedBoundingBox"], corners(away=0.5), None),
+    (["objects", 0, "objectOrientedBoundingBox"], corners(away=0.7), r"Mug\|1: .* over 0.5 m from"),
     (["objects", 0, "parentReceptacles"], 3, r"Lab: Mug\|1: parentReceptacles"),
     (["room_type"], None, "Lab: no room type; give it in the file .*--room-type or --rooms"),
     (["room_type"], 3, "Lab: room_type 3: not a name"),
