@@ -109,6 +109,9 @@ class NetworkConfig(Settings):
     """Units of each layer of the encoder."""
     hidden: int = 512
     """Units of the LSTM."""
+    context: int = 0
+    """Units of a layer that sees every detection. What it says of the frame, and the target's name,
+    go into the LSTM with the rest (docs/method.md). For tdanet; 0: none, as in the paper."""
     dropout: float = 0.0
     """Dropout rate in training, rounded to 1/256: of the Siamese difference, or after both
     convolutions of an image. The reference code's is 0.25, which changed only the speed on
@@ -408,6 +411,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
         "be at most 1,000,000",
     ),
     (("width", "hidden"), lambda value: value <= 8192, "be at most 8192"),
+    (("context",), lambda value: value == 0 or 2 <= value <= 8192, "be 0, or from 2 to 8192"),
     (("variants",), lambda value: value <= MOST_VARIANTS, f"be at most {MOST_VARIANTS}"),
     (("generated",), lambda value: value <= MOST_GENERATED, f"be at most {MOST_GENERATED:,}"),
     (("size_noise",), lambda value: 0 <= value <= 2, "be between 0 and 2"),

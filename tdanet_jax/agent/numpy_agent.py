@@ -54,6 +54,7 @@ class Meta:
     done_bias: float  # as in NetworkConfig
     reach_units: int  # of each hidden layer of the estimate of reach; 0 without it
     target_box: tuple[float, ...]  # [F], of the target's row, before its word vector
+    context: int  # as in NetworkConfig
 
     @property
     def spec(self) -> ObservationSpec:
@@ -67,9 +68,12 @@ _KINDS: dict[str, type] = {
     "classes": list, "rows": str, "sensors": list, "scores": bool, "word_norm": float,
     "width": int, "hidden": int, "action_units": int, "sensor_units": int, "target_box": list,
     "reach_threshold": float, "reach_units": int, "temperature": float, "done_bias": float,
+    "context": int,
 }  # fmt: skip
 #: Fields that folders of older versions lack.
-_DEFAULTS = {"reach_threshold": 0.0, "reach_units": 0, "temperature": 1.0, "done_bias": 0.0}
+_DEFAULTS = {
+    "reach_threshold": 0.0, "reach_units": 0, "temperature": 1.0, "done_bias": 0.0, "context": 0,
+}  # fmt: skip
 
 
 class AgentState(NamedTuple):
@@ -200,7 +204,7 @@ class NumPyAgent(BaseAgent):
     def _encode(
         self, goal: int, labels: np.ndarray, boxes: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The encoder of `models.tdanet`: attention [n] over the rows, and features [width]."""
+        """The encoder of `models.tdanet`: attention [n] over the rows, and features."""
         target = self._target(goal)
         inputs = np.zeros((len(labels), len(target.query)), np.float32)  # [n, F + D]
         for row, label, box in zip(inputs, labels.tolist(), boxes, strict=True):
@@ -208,7 +212,18 @@ class NumPyAgent(BaseAgent):
         attention = softmax(inputs @ target.query) if len(inputs) else np.zeros(0, np.float32)
         difference = np.abs(self._branch(attention @ inputs) - target.reference)
         third = _relu(self._layer("encoder/linear3", difference))
-        return attention, _relu(self._layer("encoder/linear4", third))
+        features = _relu(self._layer("encoder/linear4", third))
+        if self.meta.context:
+            features = np.concatenate([features, self._context(goal, inputs)])
+        return attention, features
+
+    def _context(self, goal: int, inputs: np.ndarray) -> np.ndarray:
+        """The features of `models.context`, from the rows [n, F + D] of a frame."""
+        rows = _relu(self._layer("encoder/scene_context/detection", inputs))
+        target = _relu(self._layer("encoder/scene_context/target", self._word(goal)))
+        if not len(rows):
+            rows = np.zeros((1, self.meta.context), np.float32)
+        return np.concatenate([rows.max(axis=0), rows.mean(axis=0), target])
 
     def _reach(self, sensors: numpy_sensors.States) -> float:
         """How probable it is that the target, being in view, is within reach (`models.reach`)."""
@@ -279,7 +294,7 @@ def load(
 
 def shapes(meta: Meta, word: int) -> dict[str, tuple[int, ...]]:
     """The parameters by name, for word vectors of this length."""
-    spec, gates = meta.spec, 4 * meta.hidden
+    spec, gates, features = meta.spec, 4 * meta.hidden, meta.width + meta.sensor_units
     layers = {
         "encoder/attention": (spec.columns + word, meta.width),
         "encoder/linear1": (spec.columns + word, meta.width),
@@ -295,12 +310,16 @@ def shapes(meta: Meta, word: int) -> dict[str, tuple[int, ...]]:
         layers["reach/linear1"] = numpy_sensors.WIDTHS["triangulation"], meta.reach_units
         layers["reach/linear2"] = meta.reach_units, meta.reach_units
         layers["reach/linear3"] = meta.reach_units, 1
+    if meta.context:
+        layers["encoder/scene_context/detection"] = spec.columns + word, meta.context
+        layers["encoder/scene_context/target"] = word, meta.context // 2
+        features += 2 * meta.context + meta.context // 2
     kernels = {f"{name}/kernel": shape for name, shape in layers.items()}
     biases = {f"{name}/bias": shape[1:] for name, shape in layers.items()}
     return {
         **kernels,
         **biases,
-        "lstm/kernel": (meta.width + meta.sensor_units + meta.hidden, gates),
+        "lstm/kernel": (features + meta.hidden, gates),
         "lstm/kernel_skip": (meta.action_units, gates),
         "lstm/bias_ih": (gates,),
         "lstm/bias_hh": (gates,),

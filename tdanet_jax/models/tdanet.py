@@ -25,6 +25,7 @@ from tdanet_jax.config import NetworkConfig
 from tdanet_jax.env.types import Observation
 from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary
+from tdanet_jax.models.context import ContextTable, SceneContext
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import Linear, look_up, look_up_in_rows
 
@@ -39,10 +40,11 @@ class ClassTable(struct.PyTreeNode):
     class_logits: jax.Array  # [C_t, C], attention logit of a class's word vector
     box_logits: jax.Array  # [C_t, F], attention logit of a unit of x, y, S and the score
     reference: jax.Array  # [C_t, H], the target's branch of the Siamese comparison
+    context: ContextTable | None = None
 
 
 class TDANetEncoder(Encoder):
-    """From detections and a target class to H features.
+    """From detections and a target class to H features, and those of the context.
 
     Attributes:
       width: H, units of every layer.
@@ -53,6 +55,7 @@ class TDANetEncoder(Encoder):
         would depend on the target, so its word vector is appended to the features.
       dtype: operands of the products; parameters and sums stay float32.
       columns: F, numbers of each detection: 3, or 4 with scores.
+      context: units of the `SceneContext`, whose features are appended; 0 as in the paper.
     """
 
     width: int = 512
@@ -60,6 +63,7 @@ class TDANetEncoder(Encoder):
     siamese: bool = True
     dtype: Any = jnp.float32
     columns: int = 3
+    context: int = 0
 
     @property
     def dropout_units(self) -> int:
@@ -72,6 +76,8 @@ class TDANetEncoder(Encoder):
 
         if self.target_attention:
             self.attention = Linear(self.width)
+        if self.context:
+            self.scene_context = SceneContext(self.context, self.columns)
         self.linear1, self.linear2, self.linear3, self.linear4 = (linear() for _ in range(4))
 
     def prepare(self, words: jax.Array) -> ClassTable:
@@ -88,7 +94,8 @@ class TDANetEncoder(Encoder):
             units = self.attention(jnp.eye(columns, words.shape[1] + columns)) - bias  # [F, H]
             names = self.attention(jnp.pad(words, ((0, 0), (columns, 0))))  # [C, H], bias included
             class_logits, box_logits = queries @ names.T, queries @ units.T
-        return ClassTable(words, class_logits, box_logits, self.branch(targets))
+        context = self.scene_context.prepare(words) if self.context else None
+        return ClassTable(words, class_logits, box_logits, self.branch(targets), context)
 
     def branch(self, rows: jax.Array) -> jax.Array:
         """Linear1 and Linear2, shared by the attended detection and the target."""
@@ -116,7 +123,7 @@ class TDANetEncoder(Encoder):
         action: jax.Array,
         dropout_mask: jax.Array | None = None,
     ) -> jax.Array:
-        """The features of a batch of observations, [..., H]."""
+        """The features of a batch of observations, [..., H], and those of the context."""
         weights = self.attend(class_table, obs)
         chex.assert_equal_shape([weights, obs.mask, obs.classes])
         # The all-zero row of an empty frame has no word vector.
@@ -131,7 +138,11 @@ class TDANetEncoder(Encoder):
             features = jnp.where(dropout_mask, features / (1 - self.dropout), 0.0)
         if not self.siamese and not self.target_attention:
             features = jnp.concatenate([features, class_table.words[obs.target]], axis=-1)
-        return nn.relu(self.linear4(nn.relu(self.linear3(features))))
+        features = nn.relu(self.linear4(nn.relu(self.linear3(features))))
+        if not self.context:
+            return features
+        seen = self.scene_context(class_table.context, obs)
+        return jnp.concatenate([features, seen], axis=-1)
 
 
 def make(
@@ -149,6 +160,7 @@ def make(
         siamese=siamese,
         dtype=dtype,
         columns=config.spec.columns,
+        context=config.context,
     )
     return ActorCritic(encoder, hidden=config.hidden, dtype=dtype)
 

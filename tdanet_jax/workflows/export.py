@@ -30,7 +30,7 @@ MODULES = (
     "io/escaping", "io/files", "io/untrusted/__init__", "io/untrusted/budgets",
     "io/untrusted/hdf5", "io/untrusted/npz", "io/untrusted/regular", "labels", "observation_spec",
     "poses", "registry", "sensors/__init__", "sensors/detections", "sensors/numpy_sensors",
-    "sensors/shared", "vocabulary", "words",
+    "sensors/shared", "settings", "vocabulary", "words",
 )  # fmt: skip
 #: The package's name in the exported folder, too.
 PACKAGE = "tdanet_jax"
@@ -94,6 +94,7 @@ def _write_agent(agent: Agent, word_vectors: str | None, folder: Path) -> None:
         "done_bias": float(network.done_bias),
         "reach_units": 0 if network.reach_threshold is None else reach.UNITS,
         "target_box": TARGET_BOX[: spec.columns],
+        "context": network.context,
     }
     weights = traverse_util.flatten_dict(jax.device_get(agent.weights), sep="/")
     arrays = {name: np.asarray(array, np.float32) for name, array in sorted(weights.items())}

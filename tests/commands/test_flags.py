@@ -666,7 +666,7 @@ OF_THE_TASK: dict[str, tuple[Any, str]] = {
     "first_order": (True, "savn"), "precision": ("bfloat16", "tdanet"), "split": ("14/8", "tdanet"),
     "model": ("ssnet", "tdanet"), "noise": ("mix", "tdanet"), "scores": (True, "tdanet"),
     "robust_triangulation": (True, "tdanet"), "reach_threshold": (0.5, "tdanet"),
-    "temperature": (0.5, "tdanet"), "done_bias": (1.0, "tdanet"),
+    "temperature": (0.5, "tdanet"), "done_bias": (1.0, "tdanet"), "context": (8, "tdanet"),
 }  # fmt: skip
 #: Settings with a test of their own below.
 HERE = ("data", "word_vectors", "checkpoint_minutes")
