@@ -44,6 +44,7 @@ from tdanet_jax.poses import ITHOR, TURNS, PoseGrid
 from tdanet_jax.scenes import house
 from tdanet_jax.scenes.room_names import Kinds, RoomKind, check_kind, check_name
 from tdanet_jax.scenes.scene import MOST_OBJECTS, MOST_POINTS, Scene, SceneError, SceneObject
+from tdanet_jax.scenes.visibility.geometry import next_positions
 from tdanet_jax.splits import in_order, is_plain, known_type
 from tdanet_jax.vocabulary import IGNORED
 
@@ -183,8 +184,8 @@ def _corners(scene: str, name: str, oriented: Any, aligned: np.ndarray) -> np.nd
     slip = np.abs(np.triu(edges @ edges.T, 1) / np.maximum(lengths[:, None], lengths)).max()
     if max(off, slip) > SKEW:
         raise SceneError(
-            f"{scene}: {name}: cornerPoints are no box in AI2-THOR's order: around the bottom face, "
-            "then above each of these"
+            f"{scene}: {name}: cornerPoints are no box in AI2-THOR's order: around the bottom "
+            "face, then above each of these"
         )
     middle = corners.mean(axis=0)
     if np.maximum(aligned[0] - middle, middle - aligned[1]).max() > APART:
@@ -269,10 +270,19 @@ def _read_scene(document: Any, kinds: Kinds) -> Scene:
         rotation,
         grid,
     )
+    if document.get("gridSize") is None and len(scene.points) > 1 and _are_apart(scene.points):
+        raise SceneError(
+            f"{name}: no two positions are {grid.grid_size:g} m apart; is gridSize missing?"
+        )
     if rooms:
         types = house.types_at(scene.points[:, [0, 2]], rooms)
         scene = dataclasses.replace(scene, room_type=types)
     return dataclasses.replace(scene, part=part, targets=_targets(name, document))
+
+
+def _are_apart(points: np.ndarray) -> bool:
+    """Whether no step leads from any of `points` [P, 3] to another."""
+    return bool((np.arange(len(points)) == next_positions(points).T).all())
 
 
 def _targets(scene: str, document: Mapping[str, Any]) -> tuple[str, ...]:

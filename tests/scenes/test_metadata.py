@@ -234,6 +234,12 @@ CASES = [
     (["split"], "half", "Lab: part 'half', not train or test"),
     (["split"], ["test"], "Lab: part "),
     (["gridSize"], 0.4, "Lab: reachable position x .*: off the 0.4 m grid"),
+    (
+        ["reachable_positions"],
+        [{"x": 0.5 * i, "y": 0.9, "z": 0.0} for i in range(3)],
+        "Lab: no two positions are 0.25 m apart; is gridSize missing?",
+    ),
+    (["reachable_positions"], [{"x": 0.0, "y": 0.9, "z": 0.0}], None),
     (["gridSize"], "wide", "Lab: gridSize wide: must be from 0.05 to 0.5 metres"),
     (["rotateStepDegrees"], 40, r"Lab: rotateStepDegrees 40, not one of \[15, 30, 45, 60, 90\]"),
     (["rotateStepDegrees"], "90", "Lab: rotateStepDegrees '90', not one of"),

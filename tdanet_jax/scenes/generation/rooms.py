@@ -10,7 +10,7 @@ from tdanet_jax.scenes.generation import catalogue
 from tdanet_jax.scenes.generation.furnish import ON_FURNITURE, Furnisher
 from tdanet_jax.scenes.generation.pieces import Library
 from tdanet_jax.scenes.generation.plan import Plan, Plans
-from tdanet_jax.scenes.generation.room_types import BUILDERS
+from tdanet_jax.scenes.generation.room_types import BUILDERS, IN_KITCHENS
 from tdanet_jax.scenes.placement import statistics
 from tdanet_jax.scenes.scene import Scene, SceneError
 
@@ -29,7 +29,7 @@ class Generator:
         """`scenes` are the known rooms: training rooms alone, for rooms to train in.
 
         Raises:
-          SceneError: they are not rooms of all of iTHOR's types.
+          SceneError: they are not rooms of all of iTHOR's types, or lack what is built in.
         """
         self._usual = statistics(scenes, ON_FURNITURE)
         self._catalogue = catalogue.load()
@@ -38,6 +38,10 @@ class Generator:
         if lacking := [room for room in BUILDERS if room not in self._plans.room_types]:
             raise SceneError(
                 f"rooms are generated after training rooms, and there is no {lacking[0]}"
+            )
+        if lacking := [name for name in IN_KITCHENS if name not in self._library]:
+            raise SceneError(
+                f"rooms are generated after training rooms, and none has a {', '.join(lacking)}"
             )
 
     def room(self, number: int, seed: int) -> Scene:
@@ -50,6 +54,7 @@ class Generator:
         room_type = types[(number - 1) % len(types)]
         name = f"{room_type}-{(number - 1) // len(types) + 1:04d}"
         plan: Plan | None = None
+        obstacle = ""
         for attempt in range(ATTEMPTS):
             draw = np.random.default_rng([seed, number, attempt])
             if plan is None or attempt % SCALED == 0:
@@ -57,16 +62,19 @@ class Generator:
             room = Furnisher(plan, self._plans, self._library, self._usual, self._catalogue, draw)
             room.openings()
             if not BUILDERS[room_type](room):
+                obstacle = "no place for what is built in"
                 plan = plan.scaled(GROWTH)
                 continue
             room.furnish()
             # The same again, larger or smaller, until an agent has as much room as it should.
             share = len(room.floor.points) / plan.points
             if not LEAST <= share <= MOST:
+                obstacle = f"{share:.0%} of the reachable points of the room that it is like"
                 plan = plan.scaled(share**-SLOWLY)
                 continue
             scene = room.scatter(name)
             if room.missing <= MISSING:
                 return scene
+            obstacle = f"no place for {room.missing:.0%} of its objects"
             plan = plan.scaled(GROWTH)
-        raise SceneError(f"{name}: no such room in {ATTEMPTS} attempts")
+        raise SceneError(f"{name}: no such room in {ATTEMPTS} attempts; the last: {obstacle}")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tdanet_jax.scenes import furniture, reachable
+from tdanet_jax.scenes.generation import rooms as rooms_module
 from tdanet_jax.scenes.generation.floor import AHEAD, RIGHT
 from tdanet_jax.scenes.generation.rooms import Generator
 from tdanet_jax.scenes.placement import TOUCHING
@@ -122,6 +123,34 @@ def test_nothing_but_the_known_rooms_is_looked_at(known: list[Scene]) -> None:
     assert not same(room, Generator(known).room(2, 7))
     with pytest.raises(SceneError, match="there is no bathroom"):
         Generator([scene for scene in known if scene.room_type != "bathroom"])
+
+
+def test_what_the_known_rooms_lack_is_named(known: list[Scene]) -> None:
+    def without(scene: Scene) -> Scene:
+        kept = [o for o in scene.objects if o.object_class not in ("Sink", "StoveKnob")]
+        return dataclasses.replace(scene, objects=tuple(kept))
+
+    with pytest.raises(SceneError, match=r"and none has a Sink, StoveKnob$"):
+        Generator([without(scene) for scene in known])
+
+
+def test_what_stands_in_the_way_of_a_room_is_named(
+    generator: Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rooms_module, "ATTEMPTS", 1)
+    said = r"kitchen-0001: no such room in 1 attempts; the last: "
+    with monkeypatch.context() as patch:
+        patch.setitem(rooms_module.BUILDERS, "kitchen", lambda room: False)
+        with pytest.raises(SceneError, match=said + "no place for what is built in"):
+            generator.room(1, 7)
+    with monkeypatch.context() as patch:
+        patch.setattr(rooms_module, "LEAST", 9.0)
+        with pytest.raises(SceneError, match=said + "[0-9]+% of the reachable points"):
+            generator.room(1, 7)
+    monkeypatch.setattr(rooms_module, "LEAST", 0.0)
+    monkeypatch.setattr(rooms_module, "MISSING", -1.0)
+    with pytest.raises(SceneError, match=said + "no place for [0-9]+% of its objects"):
+        generator.room(1, 7)
 
 
 def test_sizes_are_those_of_training_rooms(rooms: list[Scene], known: list[Scene]) -> None:
