@@ -109,6 +109,10 @@ class Split:
         """
         train = tuple(name for name in self.train_scenes if name in scenes)
         evaluated = tuple(name for name in self.eval_scenes if name in scenes)
+        if evaluated and not train and self.name.endswith(OF_VALIDATION):
+            raise ValueError(
+                "--validation: needs two training rooms of a type, to evaluate in one of them"
+            )
         for title, left in (("training", train), ("evaluation", evaluated)):
             if not left:
                 raise ValueError(

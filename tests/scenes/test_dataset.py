@@ -165,6 +165,23 @@ def test_rooms_with_a_part_of_their_own() -> None:
     assert dataset.assign_rooms(split, Rooms(rooms.tables, None)) == split
 
 
+@pytest.mark.parametrize(("count", "expected"), [(1, None), (2, ["Own0"]), (3, ["Own0", "Own1"])])
+def test_validation_needs_two_training_rooms_of_a_type(
+    count: int, expected: list[str] | None
+) -> None:
+    names = [f"Own{i}" for i in range(count)]
+    tables = tabulation.build([dataclasses.replace(toy.corridor(), name=name) for name in names])
+    rooms = Rooms(tables, Extras(parts=dict.fromkeys(names, "train")))
+    split = dataset.assign_rooms(make_split("22/0", True), rooms, True)
+    if expected is None:
+        with pytest.raises(ValueError, match="--validation: needs two training rooms of a type"):
+            split.within(names, tables.classes)
+    else:
+        split = split.within(names, tables.classes)
+        assert split.train_scenes == tuple(expected)
+        assert split.eval_scenes == tuple(names[len(expected) :])
+
+
 def split_in(rooms: Rooms, text: str, validation: bool = False, targets: str = "paper") -> Split:
     """The split of these rooms, before it is cut down to them."""
     _, chosen = dataset.find_targets(targets, rooms, validation)
