@@ -40,20 +40,36 @@ class Reader:
           FileError: it is a link, is stored in another file, too large, not numeric, not finite,
             or of another shape.
         """
-        import h5py
-
         with _plain_errors(self._path):
-            link = self._file.get(name, getlink=True)
-            if not isinstance(link, h5py.HardLink):
-                raise FileError(self._path, f"{name} is a link")
-            dataset = self._file[name]
-            if not isinstance(dataset, h5py.Dataset):
-                raise FileError(self._path, f"{name} is not a dataset")
+            dataset = self._dataset(name)
             self._check(name, dataset, shape)
             value = np.asarray(dataset[()])
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             raise FileError(self._path, f"{name} holds NaN or infinity")
         return value
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """The shape of a dataset of any size, of which nothing is read.
+
+        Raises:
+          FileError: it is a link, or has no shape.
+        """
+        with _plain_errors(self._path):
+            shape = self._dataset(name).shape
+        if shape is None:
+            raise FileError(self._path, f"{name} has no shape")
+        return tuple(map(int, shape))
+
+    def _dataset(self, name: str) -> Any:
+        import h5py
+
+        link = self._file.get(name, getlink=True)
+        if not isinstance(link, h5py.HardLink):
+            raise FileError(self._path, f"{name} is a link")
+        dataset = self._file[name]
+        if not isinstance(dataset, h5py.Dataset):
+            raise FileError(self._path, f"{name} is not a dataset")
+        return dataset
 
     def _check(self, name: str, dataset: Any, shape: tuple[int, ...] | None) -> None:
         """Refuses a dataset before anything of it is read."""

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
+from tdanet_jax.io.escaping import in_line
 from tdanet_jax.io.untrusted import FileError, hdf5
 from tdanet_jax.scenes.offline import layout
 from tdanet_jax.vocabulary import IMAGE_SIZE
@@ -49,12 +50,15 @@ def recorded(folder: Path) -> tuple[Frame | None, str]:
     if images.is_file():
         try:
             with hdf5.opened(images) as reader:
-                shape = reader.read(reader.names()[0]).shape
-            if len(shape) == 3 and max(shape[:2]) <= LARGEST:
+                names = reader.names()
+                shape = reader.shape(names[0]) if names else ()
+            if len(shape) == 3 and shape[2] in (3, 4) and 0 < min(shape) <= max(shape) <= LARGEST:
                 return Frame(shape[1], shape[0]), images.name
-            problem = f"{images.name}: shape {shape} is not that of an image"
-        except (FileError, IndexError):  # images themselves are not needed
-            problem = f"{images.name} is empty or not readable, or h5py is missing"
+            problem = f"{images.name}: " + (
+                f"shape {shape} is not that of an image" if names else "no images"
+            )
+        except FileError as error:  # images themselves are not needed
+            problem = str(error).removeprefix(f"{in_line(folder)}/")
     if metadata.is_file():
         with metadata.open("rb") as file:
             head = file.read(_HEAD)

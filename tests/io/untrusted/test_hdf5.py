@@ -58,6 +58,14 @@ def test_what_is_read(path: Path) -> None:
             reader.read("good", (3, 2))
 
 
+def test_shapes_of_what_is_too_large_to_be_read(path: Path) -> None:
+    with hdf5.opened(path) as reader:
+        assert reader.shape("huge") == (10**12,)
+        for name, reason in (("soft link", "is a link"), ("group", "is not a dataset")):
+            with pytest.raises(FileError, match=rf"a\.h5: {name} {reason}"):
+                reader.shape(name)
+
+
 @pytest.mark.parametrize("content", [b"", b"text", b"\x89HDF\r\n\x1a\n" + bytes(600)])
 def test_what_is_not_hdf5(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "b.h5"

@@ -28,16 +28,25 @@ def test_images_tell_their_size(tmp_path: Path) -> None:
     assert frames.recorded(tmp_path) == (None, "")
     for shape, expected in (
         ((480, 640, 3), (Frame(640, 480), "images.hdf5")),
+        ((1080, 1920, 3), (Frame(1920, 1080), "images.hdf5")),  # more than is read of a dataset
+        ((300, 300, 4), (Frame(300, 300), "images.hdf5")),
         ((5,), (None, "images.hdf5: shape (5,) is not that of an image")),
+        ((3, 300, 300), (None, "images.hdf5: shape (3, 300, 300) is not that of an image")),
+        ((0, 300, 3), (None, "images.hdf5: shape (0, 300, 3) is not that of an image")),
     ):
         with h5py.File(tmp_path / "images.hdf5", "w") as file:
             file["0.00|0.00|0|0"] = np.zeros(shape, np.uint8)
         assert frames.recorded(tmp_path) == expected
+    with h5py.File(tmp_path / "images.hdf5", "w") as file:
+        file["link"] = h5py.SoftLink("/elsewhere")
+    assert frames.recorded(tmp_path) == (None, "images.hdf5: link is a link")
+    h5py.File(tmp_path / "images.hdf5", "w").close()
+    assert frames.recorded(tmp_path) == (None, "images.hdf5: no images")
     for content in (b"", b"damaged"):
         (tmp_path / "images.hdf5").write_bytes(content)
-        assert frames.recorded(tmp_path) == (
-            None, "images.hdf5 is empty or not readable, or h5py is missing"
-        )  # fmt: skip
+        found, problem = frames.recorded(tmp_path)
+        assert found is None
+        assert problem.startswith("images.hdf5: not a readable HDF5 file (")
 
 
 def test_metadata_tell_the_size_of_the_screen(tmp_path: Path) -> None:
