@@ -42,14 +42,16 @@ class KnownRoom(NamedTuple):
 
     grid: Grid
     classes: Collection[str]
+    room_type: str = ROOM_TYPES[0]
 
 
 def read_extras(
-    folders: Iterable[Path], rooms: Mapping[str, KnownRoom]
+    folders: Iterable[Path], rooms: Mapping[str, KnownRoom], own: Collection[Path] = ()
 ) -> tuple[Extras, list[str]]:
     """Each of the extras from the first folder that has it, and lines on each.
 
     Args:
+      own: the folders in which a `targets.json` is of these rooms: others use the name, too.
       rooms: the imported scenes; episodes that do not fit them are left out.
 
     Raises:
@@ -57,12 +59,13 @@ def read_extras(
     """
     places = list(folders)
     parents, adjacency = _first(places, PARENT_FILE), _first(places, GRAPH_FOLDER)
-    published, own = _first(places, EPISODE_FOLDER), _first(places, TARGET_FILE)
+    published, targets = _first(places, EPISODE_FOLDER), _first([*own], TARGET_FILE)
     extras, lines = Extras(), []
-    if own is not None:
+    if targets is not None:
         classes = {name for room in rooms.values() for name in room.classes}
-        extras = dataclasses.replace(extras, targets=read_targets(own, classes))
-        lines.append(f"{own}: targets of {', '.join(extras.targets)}")
+        types = {*ROOM_TYPES, *(room.room_type for room in rooms.values())}
+        extras = dataclasses.replace(extras, targets=read_targets(targets, classes, types))
+        lines.append(f"{targets}: targets of {', '.join(extras.targets)}")
     if parents is not None:
         extras = dataclasses.replace(extras, parents=read_parents(parents))
         count = sum(len(targets) for targets in extras.parents.values())
@@ -119,20 +122,27 @@ def read_parents(path: Path) -> dict[str, dict[str, dict[str, float]]]:
     return result
 
 
-def read_targets(path: Path, classes: Collection[str]) -> dict[str, tuple[str, ...]]:
+def read_targets(
+    path: Path, classes: Collection[str], types: Collection[str]
+) -> dict[str, tuple[str, ...]]:
     """Room type -> target classes, from `targets.json`.
 
     Raises:
-      FileError: its structure is another, or no room holds a class.
+      FileError: its structure is another, a room type occurs twice, or no room is of a type or
+        holds a class.
     """
-    found = {}
+    found: dict[str, tuple[str, ...]] = {}
     for title, names in jsons.members(path):
+        room = known_type(title)
+        if room not in types or room in found:
+            problem = "is there twice" if room in found else "no room is of this type"
+            raise FileError(path, f"{title}: {problem}")
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise FileError(path, f"{title}: not a list of classes")
         for name in names:
             if name not in classes or not is_plain(name):
                 raise FileError(path, f"{title}: {name}: no room holds such a class")
-        found[known_type(title)] = in_order(names)
+        found[room] = in_order(names)
     return found
 
 
@@ -150,6 +160,8 @@ def read_graph(names_path: Path, matrix_path: Path) -> tuple[tuple[str, ...], np
     names = tuple(line.strip() for line in text.splitlines() if line.strip())
     if not 0 < len(names) <= MOST_CLASSES or len(set(names)) != len(names):
         raise FileError(names_path, "not a list of distinct class names")
+    if odd := next((name for name in names if not name.isprintable()), None):
+        raise FileError(names_path, f"class {odd[:40]}: has a control character")
     value = pickles.load_torch(content, matrix_path)
     matrix = pickles.array(value, matrix_path, MOST_CLASSES**2)
     if matrix.shape != (len(names), len(names)):

@@ -66,11 +66,12 @@ def read_folder(
         report(len(rooms) / len(chosen), line)
     _warn_of_borders(rooms)
     known = {
-        room.scenes[0]: KnownRoom(Grid(room.position), frozenset(room.classes)) for room in rooms
+        scene.name: KnownRoom(Grid(room.position), frozenset(room.classes), scene.room_type)
+        for scene, room in zip(chosen, rooms, strict=True)
     }
     # The reference keeps its test episodes two folders above the scenes.
     places = [root, folder, folder / "data", *root.resolve().parents[:2]]
-    extras, lines = read_extras(places, known)
+    extras, lines = read_extras(places, known, (root, folder))
     parts = {scene.name: scene.part for scene in chosen if scene.part is not None}
     extras = dataclasses.replace(extras, parts=parts)
     for line in (*left_out, *lines):

@@ -19,6 +19,7 @@ from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.offline import extras, importer
 from tdanet_jax.scenes.offline.extras import KnownRoom
 from tdanet_jax.task import make_task
+from tdanet_jax.vocabulary import ROOM_TYPES
 from tdanet_jax.words import WordVectors
 from tests.support import original
 
@@ -101,12 +102,37 @@ def test_broken_parents(tmp_path: Path) -> None:
 def test_targets_next_to_the_scenes(tmp_path: Path) -> None:
     path = tmp_path / "targets.json"
     path.write_text('{"LivingRoom": ["Vase", "Mug"], "shop": ["Mug"]}')
-    found = extras.read_targets(path, {"Mug", "Vase"})
+    types = {*ROOM_TYPES, "shop"}
+    found = extras.read_targets(path, {"Mug", "Vase"}, types)
     assert found == {"living_room": ("Mug", "Vase"), "shop": ("Mug",)}
     for content in ('["Mug"]', '{"shop": "Mug"}', '{"shop": [1]}', '{"shop": ["Kettle"]}'):
         path.write_text(content)
         with pytest.raises(FileError, match=r"targets\.json: "):
-            extras.read_targets(path, {"Mug", "Vase"})
+            extras.read_targets(path, {"Mug", "Vase"}, types)
+    for content, reason in (
+        ('{"attic": ["Mug"]}', "attic: no room is of this type"),
+        ('{"Kitchen": ["Mug"], "kitchen": ["Vase"]}', "kitchen: is there twice"),
+    ):
+        path.write_text(content)
+        with pytest.raises(FileError, match=rf"targets\.json: {reason}"):
+            extras.read_targets(path, {"Mug", "Vase"}, types)
+
+
+def test_targets_above_the_scenes_are_those_of_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Prometheus has a file of this name, too."""
+    monkeypatch.setenv("TDANET_CACHE", str(tmp_path / "cache"))
+    scenes = original.write_all(tmp_path / "original")
+    for place in (scenes.parent, scenes.parent.parent):
+        (place / "targets.json").write_text('[{"targets": ["localhost"]}]')
+    found = importer.read_folder(scenes, lambda share, line: None).extras
+    assert found is not None
+    assert found.targets == {}
+    (scenes / "targets.json").write_text('{"kitchen": ["Mug"]}')
+    found = importer.read_folder(scenes.parent, lambda share, line: None).extras
+    assert found is not None
+    assert found.targets == {"kitchen": ("Mug",)}
 
 
 def test_broken_graphs(tmp_path: Path) -> None:
@@ -115,6 +141,7 @@ def test_broken_graphs(tmp_path: Path) -> None:
         ("A\nB\n", np.eye(3), r"adjmat\.dat: shape \(3, 3\) is not that of 2 classes"),
         ("A\nA\n", np.eye(2), r"objects\.txt: not a list of distinct class names"),
         ("", np.eye(0), r"objects\.txt: not a list"),
+        ("A\nB\tC\n", np.eye(2), r"objects\.txt: class B.C: has a control character"),
         ("A\nB\n", np.full((2, 2), np.nan), r"adjmat\.dat: holds NaN"),
         ("A\nB\n", -np.eye(2), r"adjmat\.dat: holds .* a weight below 0"),
         ("A\nB\n", {"a": 1}, r"adjmat\.dat: something other than an array"),
