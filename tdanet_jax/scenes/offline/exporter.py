@@ -11,7 +11,7 @@ import numpy as np
 
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import hdf5
-from tdanet_jax.poses import ITHOR
+from tdanet_jax.poses import GRID_SIZE, ITHOR
 from tdanet_jax.scenes.offline import layout
 from tdanet_jax.scenes.offline.connected import Connected, largest_parts
 from tdanet_jax.scenes.offline.layout import Report, state_keys
@@ -74,7 +74,13 @@ def write_folder(
 
 
 def check_layout(tables: SceneTables) -> None:
-    """Raises ValueError if the original layout cannot hold these rooms."""
+    """Raises ValueError if the original layout cannot hold these rooms.
+
+    Its keys are coordinates to the centimetre, which tell the rooms' points apart and a step long;
+    a class with a bar would be read as an object's id, and one with a slash is no name in HDF5.
+    """
+    if odd := [name for name in tables.classes if {*name} & {"/", "|"}]:
+        raise ValueError(f"class {odd[0]}: the original layout cannot hold names with / or |")
     last = tables.room_types[tables.position_room_type.max()]
     if last not in ROOM_TYPES:
         what = f"rooms of type {last}"
@@ -82,9 +88,22 @@ def check_layout(tables: SceneTables) -> None:
         what = "houses with rooms of several types"
     elif tables.grid != ITHOR:
         what = "rooms on another grid than iTHOR's"
+    elif room := _off_centimetres(tables):
+        what = f"{room}, whose points in whole centimetres are not {GRID_SIZE} m apart"
     else:
         return
     raise ValueError(f"{what}: the original layout has rooms of iTHOR's types and grid alone")
+
+
+def _off_centimetres(tables: SceneTables) -> str | None:
+    """A room in which a step between neighbours is not one of 0.25 m in the keys of states."""
+    for scene, name in enumerate(tables.scenes):
+        ground = tables.position[tables.position_scene == scene][:, [0, 2]]
+        cells = np.rint((ground - ground[0]) / GRID_SIZE)
+        rounded = np.array([[round(value, 2) for value in point] for point in ground.tolist()])
+        if np.abs(rounded - rounded[0] - cells * GRID_SIZE).max() > 1e-6:
+            return name
+    return None
 
 
 def write_scene(room: SceneTables, folder: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import warnings
 from collections import Counter
 from pathlib import Path
@@ -229,6 +230,20 @@ def test_nothing_is_written_outside_of_the_folder(
     with pytest.raises(SceneError, match="room name"):
         exporter.write_folder(room, tmp_path / "a" / "b" / "out", silent)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_rooms_that_the_layout_cannot_hold() -> None:
+    def tables(name: str = "Mug", x: float = 0.0) -> SceneTables:
+        spots = toy.points((x, 0.0), (x + 0.25, 0.0))
+        return tabulation.build([toy.room(spots, toy.thing(name, (0.0, toy.CAMERA, 1.2)))])
+
+    exporter.check_layout(tables())
+    exporter.check_layout(tables(x=-0.001))
+    for name in ("salt/pepper", "a|b"):
+        with pytest.raises(ValueError, match=rf"class {re.escape(name)}: .* names with / or \|"):
+            exporter.check_layout(tables(name))
+    with pytest.raises(ValueError, match=r"Toy, whose points in whole centimetres are not 0\.25 m"):
+        exporter.check_layout(tables(x=0.125))  # keys 0.12 and 0.38
 
 
 def test_parents_survive_export_and_import(ithor: SceneTables) -> None:
