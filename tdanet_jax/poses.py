@@ -65,7 +65,7 @@ class PoseGrid:
     def __post_init__(self) -> None:
         size, looks = self.grid_size, self.horizons
         if type(size) not in (int, float) or not SIZES[0] <= size <= SIZES[1]:
-            raise ValueError(f"gridSize {size}: must be from {SIZES[0]} to {SIZES[1]} metres")
+            raise ValueError(f"gridSize {size!r}: must be from {SIZES[0]} to {SIZES[1]} metres")
         if type(self.rotations) is not int or self.rotations not in [360 // t for t in TURNS]:
             raise ValueError(
                 f"{self.rotations} rotations: rotateStepDegrees must be one of {list(TURNS)}"

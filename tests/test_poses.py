@@ -80,6 +80,7 @@ def test_steps_go_to_the_neighbour_in_the_nearest_direction() -> None:
         ({"grid_size": 0.04}, "gridSize 0.04: must be from 0.05 to 0.5 metres"),
         ({"grid_size": float("nan")}, "gridSize nan"),
         ({"grid_size": True}, "gridSize True"),
+        ({"grid_size": "0.25"}, "gridSize '0.25': must be from 0.05 to 0.5 metres"),
         ({"rotations": 16}, "16 rotations"),
         ({"rotations": 8.0}, "8.0 rotations"),
         ({"horizons": ()}, "horizons"),

@@ -50,9 +50,6 @@ def collect(
                 "name": name,
                 "room_type": room_type,
                 "gridSize": grid_size,
-                "agent": {
-                    key: start["agent"][key] for key in ("position", "rotation", "cameraHorizon")
-                },
                 "reachable_positions": event.metadata["actionReturn"],
                 "objects": [
                     {field: record.get(field) for field in FIELDS} for record in start["objects"]

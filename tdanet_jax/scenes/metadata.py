@@ -16,7 +16,6 @@ A scene file is JSON: a scene or a list of scenes, each an object with
                          without it the flags of `import` decide, or the name
     targets              optional, names of classes: the targets in all rooms of the scene's type,
                          with those of the file's other scenes of the type, in place of the paper's
-    agent                optional, metadata["agent"] in the same frame, to verify the flags
 
 The grid, that is gridSize, rotateStepDegrees and horizons, is the same for all scenes of a file.
 
@@ -62,7 +61,6 @@ def parse_scene(
     records: Sequence[Mapping[str, Any]],
     points: np.ndarray,
     default_position: np.ndarray | None = None,
-    default_rotation: int | None = None,
     grid: PoseGrid = ITHOR,
 ) -> Scene:
     """A room from AI2-THOR's object records and reachable points [P, 3], which get sorted.
@@ -82,9 +80,7 @@ def parse_scene(
     if times > 1:
         raise SceneError(f"{name}: {identity}: id occurs {times} times")
     points = check_points(name, points, grid.grid_size)
-    return Scene(
-        name, room_type, points, tuple(objects), default_position, default_rotation, grid=grid
-    )
+    return Scene(name, room_type, points, tuple(objects), default_position, grid=grid)
 
 
 def check_points(name: str, points: np.ndarray, size: float = ITHOR.grid_size) -> np.ndarray:
@@ -250,6 +246,8 @@ def _read_scene(document: Any, kinds: Kinds) -> Scene:
     check_name(name)
     room_type, part = _kind(name, document, kinds)
     rooms = _rooms(name, document)
+    if rooms and document.get("room_type") is not None:
+        raise SceneError(f"{name}: both room_type and rooms, which have types of their own")
     for key in ("objects", "reachable_positions"):
         if not isinstance(document.get(key), list):
             raise SceneError(f"{name}: {key} is not a list")
@@ -258,17 +256,12 @@ def _read_scene(document: Any, kinds: Kinds) -> Scene:
         for i, point in enumerate(document["reachable_positions"])
     ]
     grid = _grid(name, document)
-    position, rotation = None, None
-    if document.get("agent") is not None:
-        position, rotation = _agent(name, document["agent"], grid)
     scene = parse_scene(
         name,
         room_type,
         [_with_known_class(record) for record in document["objects"]],
         np.reshape(points, (-1, 3)),
-        position,
-        rotation,
-        grid,
+        grid=grid,
     )
     if document.get("gridSize") is None and len(scene.points) > 1 and _are_apart(scene.points):
         raise SceneError(
@@ -359,17 +352,3 @@ def _grid(scene: str, document: Mapping[str, Any]) -> PoseGrid:
         return PoseGrid(**{name: value for name, value in given.items() if value is not None})
     except ValueError as error:
         raise SceneError(f"{scene}: {error}") from None
-
-
-def _agent(scene: str, agent: Any, grid: PoseGrid) -> tuple[np.ndarray | None, int | None]:
-    """Position and rotation of an agent that looks level along one of the headings, or None."""
-    if not isinstance(agent, Mapping):
-        raise SceneError(f"{scene}: agent is not metadata's agent record")
-    position = _vector(scene, "agent", agent, "position")
-    turn = _vector(scene, "agent", agent, "rotation")[1]
-    horizon = agent.get("cameraHorizon", 0.0)
-    if not _is_number(horizon):
-        raise SceneError(f"{scene}: agent: cameraHorizon is not a number")
-    if abs(horizon) > 1 or abs((turn + grid.turn / 2) % grid.turn - grid.turn / 2) > 1:
-        return None, None
-    return position, round(turn / grid.turn) * grid.turn % 360

@@ -25,7 +25,7 @@ class FakeController:
         self.asked.append((scene, gridSize))
         content = copy.deepcopy(DOCUMENT)
         records = [{**record, "mass": 1.0} for record in content["objects"]]
-        return SimpleNamespace(metadata={"objects": records, "agent": content["agent"]})
+        return SimpleNamespace(metadata={"objects": records})
 
     def step(self, action: str) -> SimpleNamespace:
         self.asked.append(action)
@@ -54,7 +54,6 @@ def test_what_is_collected_can_be_read(tmp_path: Path) -> None:
     assert (first.name, first.room_type) == ("FloorPlan1", "kitchen")
     assert (second.name, second.room_type) == ("Mine", "bathroom")
     assert len(first.objects) == 2
-    assert first.default_rotation == 270
     assert [p.name for p in tmp_path.iterdir()] == ["scenes.json"]
 
 

@@ -62,11 +62,6 @@ SCENE = {
     "rotateStepDegrees": 45,
     "horizons": [0, 30],
     "split": "train",
-    "agent": {
-        "position": {"x": 0, "y": 0.9, "z": 0},
-        "rotation": {"x": 0, "y": 90, "z": 0},
-        "cameraHorizon": 0,
-    },
 }
 OLD_RUN = Path(__file__).parents[1] / "data" / "run_format_1_best"
 BUNDLED = Path(__file__).parents[2] / "agents" / "18-4-best"
