@@ -46,6 +46,7 @@ MODULES = (
     "poses",
     "vocabulary",
     "scenes.scene",
+    "scenes.room_names",
     "scenes.visibility.rules",
     "scenes.visibility.geometry",
     "scenes.visibility.rays",

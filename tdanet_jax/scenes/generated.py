@@ -29,6 +29,7 @@ CHUNK = 100  # rooms in a part, a file of the cache
 _MODULES = (
     "scenes.reachable",
     "scenes.placement",
+    "scenes.records",
     *(f"scenes.generation.{name}" for name in ("catalogue", "pieces", "plan", "floor", "furnish",
                                                "counters", "room_types", "rooms")),
     "scenes.generated",

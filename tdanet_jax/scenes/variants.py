@@ -8,6 +8,8 @@ import hashlib
 import json
 from collections.abc import Sequence
 
+import numpy as np
+
 import tdanet_jax
 from tdanet_jax.io import assets
 from tdanet_jax.scenes import cache, ithor, tabulation
@@ -25,7 +27,8 @@ from tdanet_jax.scenes.vary import vary
 SEED = 0
 
 _MODULES = tuple(
-    f"scenes.{name}" for name in ("reachable", "placement", "furniture", "vary", "variants")
+    f"scenes.{name}"
+    for name in ("reachable", "placement", "furniture", "vary", "records", "variants")
 )
 
 
@@ -47,6 +50,7 @@ def source(
         rooms.tables.data_version,
         *(hashlib.sha256(records[name].tobytes()).hexdigest() for name in sorted(records)),
         json.dumps([*names, *rooms.tables.targets]),
+        np.__version__,  # whose streams of random numbers may change
         *others,
     )
 

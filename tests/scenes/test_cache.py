@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
+import inspect
 import os
 import subprocess
 import sys
 import time
 import warnings
 from pathlib import Path
+from types import ModuleType
 from typing import IO
 
 import numpy as np
@@ -15,7 +19,9 @@ import platformdirs
 import pytest
 
 from tdanet_jax.io import files
-from tdanet_jax.scenes import cache, ithor, tabulation
+from tdanet_jax.scenes import cache, generated, ithor, tabulation, variants
+from tdanet_jax.scenes.dataset import Extras, Rooms
+from tdanet_jax.scenes.offline import importer
 from tests.support import toy
 
 # Builds, once a line has come, and prints the tables' version.
@@ -83,6 +89,53 @@ def test_other_sources_other_file(folder: Path, monkeypatch: pytest.MonkeyPatch)
     before = cache.key()
     monkeypatch.setattr(cache.inspect, "getsource", lambda module: "changed")
     assert cache.key() != before
+
+
+#: What decides nothing in a file of the cache; the last two made the asset, which is hashed itself.
+ASIDE = {
+    f"scenes.{name}"
+    for name in ("cache", "checks.survey", "dataset", "pools", "metadata", "reachable", "variants")
+}
+
+
+def imports_of(module: ModuleType) -> set[str]:
+    """The modules of scenes that a module imports, without the package's name."""
+    nodes = ast.parse(inspect.getsource(module)).body
+    pairs = [(n.module, a.name) for n in nodes if isinstance(n, ast.ImportFrom) for a in n.names]
+    found = {f"{m}.{name}" if f"{m}.{name}" in sys.modules else str(m) for m, name in pairs}
+    names = {name.removeprefix("tdanet_jax.") for name in found}
+    return {name for name in names if name.startswith("scenes.")}
+
+
+@pytest.mark.parametrize(
+    "modules",
+    [
+        cache.MODULES,
+        (*cache.MODULES, *variants._MODULES),
+        (*cache.MODULES, *generated._MODULES),
+        importer.MODULES,
+    ],
+    ids=["tables", "variants", "generated", "imports"],
+)
+def test_names_of_files_follow_from_all_modules_that_make_them(modules: tuple[str, ...]) -> None:
+    for name in modules:
+        module = importlib.import_module(f"tdanet_jax.{name}")
+        assert imports_of(module) - ASIDE <= {*modules}, name
+
+
+def test_variants_follow_from_numpys_random_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    rooms = Rooms(tabulation.build([toy.corridor()]), Extras())
+    before = variants.source(rooms, [])
+    monkeypatch.setattr(np, "__version__", "99")
+    assert variants.source(rooms, []) != before
+
+
+def test_scenes_of_an_import_follow_from_the_source(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = importer._cache_folder(folder)
+    monkeypatch.setattr(importer, "MODULES", importer.MODULES[1:])
+    assert importer._cache_folder(folder) != before
 
 
 def test_a_cache_that_cannot_be_written(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

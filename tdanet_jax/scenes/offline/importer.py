@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 import shutil
 import warnings
@@ -32,8 +31,13 @@ from tdanet_jax.vocabulary import ALL_TARGETS
 
 SOURCES = (layout.GRID_FILE, layout.GRAPH_FILE, layout.BOX_FILE, layout.OBJECT_FILE,
            layout.IMAGE_FILE, *layout.VISIBILITY_FILES)  # fmt: skip
-#: Version of the cached scenes, and part of their name.
-FORMAT = 3
+#: Modules that make the cached scenes.
+MODULES = (
+    *cache.MODULES,
+    *(f"scenes.{name}" for name in ("house", "metadata")),
+    *(f"scenes.offline.{name}" for name in ("layout", "object_ids", "frames", "matching",
+                                            "reader")),
+)  # fmt: skip
 #: Share of the frame's width or height from which a box comes near its border.
 NEAR = 0.9
 
@@ -107,8 +111,7 @@ def _warn_of_borders(rooms: Sequence[SceneTables]) -> None:
 
 
 def _cache_folder(root: Path) -> Path:
-    name = hashlib.sha256(str(root.resolve()).encode()).hexdigest()[:16]
-    return cache.folder() / f"{cache.IMPORTS}{FORMAT}-{name}"
+    return cache.folder() / f"{cache.IMPORTS}{cache.source_hash(MODULES, str(root.resolve()))}"
 
 
 def _read_cached(cached: Path, scene: SceneFolder, frame: Frame | None) -> tuple[SceneTables, str]:
