@@ -165,7 +165,7 @@ def _rest(rows: np.ndarray) -> Rest:
     return Rest(height, bool(side), max(float(margin), 0.0), max(float(gap), RADIUS))
 
 
-def replace(
+def rearrange(
     scene: Scene, known: Statistics, draw: np.random.Generator, left_out: float
 ) -> tuple[SceneObject, ...]:
     """The objects of a room, the small ones elsewhere: each on a receptacle that holds its class.

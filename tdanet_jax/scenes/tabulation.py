@@ -174,14 +174,20 @@ def paint(
     """
     raster = np.full(states * CELLS * CELLS, -1, np.int8)
     by_state = np.argsort(state, kind="stable")
-    starts = np.flatnonzero(np.diff(state[by_state], prepend=-1))
-    # Batches end where a state ends: within a state, the order of painting matters.
-    bounds = [0, *starts[np.unique(np.searchsorted(starts, range(BOXES, len(state), BOXES)))
-                         .clip(max=len(starts) - 1)].tolist(), len(state)]  # fmt: skip
-    for first, stop in itertools.pairwise(sorted(set(bounds))):
+    for first, stop in itertools.pairwise(_batches(state[by_state])):
         rows = by_state[first:stop]
         _paint(raster, state[rows], box[rows].astype(np.int32), label[rows], size)
     return raster.reshape(states, CELLS, CELLS)
+
+
+def _batches(state: np.ndarray) -> list[int]:
+    """Where batches of about `BOXES` boxes begin and end, given the ascending state of each box.
+
+    They end where a state ends: within a state, the order of painting matters.
+    """
+    starts = np.flatnonzero(np.diff(state, prepend=-1))
+    ends = np.searchsorted(starts, range(BOXES, len(state), BOXES)).clip(max=len(starts) - 1)
+    return sorted({0, *starts[ends].tolist(), len(state)})
 
 
 def _paint(

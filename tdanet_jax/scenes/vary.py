@@ -13,7 +13,7 @@ import zlib
 import numpy as np
 
 from tdanet_jax.scenes import furniture
-from tdanet_jax.scenes.placement import Statistics, replace
+from tdanet_jax.scenes.placement import Statistics, rearrange
 from tdanet_jax.scenes.room_names import UNKNOWN, kind_of
 from tdanet_jax.scenes.scene import Scene, SceneObject
 
@@ -45,7 +45,7 @@ def vary(scene: Scene, known: Statistics, seed: int, copy: int) -> Scene:
         arranged,
         name=name,
         part=scene.part or (kind_of(name) or UNKNOWN).part,
-        objects=replace(arranged, known, draw, LEFT_OUT),
+        objects=rearrange(arranged, known, draw, LEFT_OUT),
         default_position=None,
         default_rotation=None,
     )

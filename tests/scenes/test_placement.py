@@ -36,7 +36,7 @@ def pairs(train: dict[str, Scene], known: Statistics) -> list[tuple[Scene, Scene
     """Rooms, and the same with their small objects elsewhere."""
     found = []
     for name, seed in itertools.product(ROOMS, range(3)):
-        objects = placement.replace(train[name], known, np.random.default_rng(seed), 0.1)
+        objects = placement.rearrange(train[name], known, np.random.default_rng(seed), 0.1)
         found.append((train[name], dataclasses.replace(train[name], objects=objects)))
     return found
 
@@ -121,7 +121,7 @@ def test_what_holds_a_class_is_counted_as_a_loop_does(
 
 def test_the_same_draws_give_the_same_places(train: dict[str, Scene], known: Statistics) -> None:
     first, again, other = (
-        placement.replace(train["FloorPlan1"], known, np.random.default_rng(seed), 0.1)
+        placement.rearrange(train["FloorPlan1"], known, np.random.default_rng(seed), 0.1)
         for seed in (5, 5, 6)
     )
     assert [o.object_id for o in first] == [o.object_id for o in again]
@@ -207,7 +207,7 @@ def test_what_is_on_a_counter_around_a_corner_keeps_clear_of_the_corners_floor()
     )
     seen = []
     for seed in range(40):
-        objects = placement.replace(room, known, np.random.default_rng(seed), 0.0)
+        objects = placement.rearrange(room, known, np.random.default_rng(seed), 0.0)
         [item] = [o for o in objects if o.pickupable]
         seen.append(placement._gaps(item.box[None], spots)[0])
     assert 0.43 < min(seen) < 0.5
@@ -222,7 +222,7 @@ def test_what_is_shut_in_or_on_the_floor_stays() -> None:
         holds={("kitchen", name): {"DiningTable": 1} for name in ("Egg", "BasketBall", "Mug")},
     )
     objects = {
-        o.object_id: o for o in placement.replace(room, known, np.random.default_rng(0), 0.0)
+        o.object_id: o for o in placement.rearrange(room, known, np.random.default_rng(0), 0.0)
     }
     for item in (egg, ball):
         np.testing.assert_array_equal(objects[item.object_id].box, item.box)
@@ -238,7 +238,7 @@ def test_contents_move_with_their_container() -> None:
     known = placement.statistics([room])
     for seed in range(5):
         draw = np.random.default_rng(seed)
-        after = {o.object_id: o for o in placement.replace(room, known, draw, 0.3)}
+        after = {o.object_id: o for o in placement.rearrange(room, known, draw, 0.3)}
         assert ("Spoon|0" in after) == ("Bowl|0" in after)
         if "Spoon|0" in after:
             new, old = after["Bowl|0"].box, bowl.box
@@ -250,7 +250,7 @@ def test_contents_move_with_their_container() -> None:
 
 def test_one_of_the_small_objects_always_stays() -> None:
     room = kitchen()
-    after = placement.replace(room, placement.statistics([room]), np.random.default_rng(0), 1.0)
+    after = placement.rearrange(room, placement.statistics([room]), np.random.default_rng(0), 1.0)
     assert sum(item.pickupable for item in after) == 1
 
 
@@ -269,7 +269,7 @@ def test_a_towel_goes_to_a_holder_that_is_turned_likewise() -> None:
     found = set()
     for seed in range(20):
         draw = np.random.default_rng(seed)
-        [item] = [o for o in placement.replace(room, known, draw, 0.0) if o.pickupable]
+        [item] = [o for o in placement.rearrange(room, known, draw, 0.0) if o.pickupable]
         size = item.box[1] - item.box[0]
         middle = item.box.mean(axis=0)[[0, 2]].round(3)
         found.add((item.parents[0], *size.round(3), *middle))
