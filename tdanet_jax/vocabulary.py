@@ -32,6 +32,8 @@ FIELD_OF_VIEW = 90.0  # degrees, horizontal and vertical
 IMAGE_SIZE = 300  # pixels, width and height of a frame
 #: Classes that are left out of all rooms: their boxes span the room, and they hide nothing.
 IGNORED = frozenset({"Ceiling", "Floor", "Room"})
+#: Classes that are parts of the building: they hide things, and are never detections.
+WALLS, DOORS = frozenset({"Wall"}), frozenset({"Door", "Doorframe", "Doorway"})
 
 ROOM_TYPES = ("kitchen", "living_room", "bedroom", "bathroom")
 

@@ -19,13 +19,14 @@ from tdanet_jax.agent.base import Decision
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.labels import Labels
 from tdanet_jax.poses import ITHOR, PoseGrid
-from tdanet_jax.scenes.visibility.rules import RULES
 from tdanet_jax.vocabulary import (
     ACTION_NAMES,
+    DOORS,
     FIELD_OF_VIEW,
     IGNORED,
     IMAGE_SIZE,
     VISIBILITY_DISTANCE,
+    WALLS,
     Action,
 )
 
@@ -48,7 +49,7 @@ def settings(grid: PoseGrid = ITHOR) -> dict[str, Any]:
 SETTINGS = settings()
 
 #: Object types that are parts of the building; the rooms in which agents are trained have none.
-STRUCTURE = IGNORED | RULES.structure
+STRUCTURE = IGNORED | WALLS | DOORS
 
 #: What AI2-THOR's LookUp and LookDown tilt the camera by, unless they are told.
 LOOK_DEGREES = 30

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from tdanet_jax.vocabulary import DOORS, WALLS
+
 
 def _names(text: str) -> frozenset[str]:
     return frozenset(text.split())
@@ -52,8 +54,8 @@ class Rules:
 
     # Structure: parts of the building, which hide things and are never detections. A wall is inset
     # in its thickness alone. The box of a door that is not shut is a hole in the wall around it.
-    walls: frozenset[str] = _names("Wall")
-    doors: frozenset[str] = _names("Door Doorframe Doorway")
+    walls: frozenset[str] = WALLS
+    doors: frozenset[str] = DOORS
 
     # Closed: hide their contents. Toilets, sinks and bathtubs do not.
     closed: frozenset[str] = _names("Box Cabinet Drawer Fridge Microwave Safe")
