@@ -39,9 +39,9 @@ class Command:
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""
     resume: Path | None = None
-    """Folder of a run to continue. Accepts only --devices, --log, --data where the run's
-    rooms were moved to, and a new budget, which replaces the run's; its schedules then follow the
-    new one."""
+    """Folder of a run to continue. Accepts only --devices, --log, --data where the run's rooms were
+    moved to, --word-vectors likewise (the run's own copy comes first), and a new budget, which
+    replaces the run's; its schedules then follow the new one."""
     log: tuple[Literal["tensorboard", "wandb", "csv"], ...] = ()
     """Where else the metrics go: TensorBoard events (needs tensorboardX), Weights & Biases (needs
     wandb; WANDB_MODE=offline sends nothing), metrics.csv."""

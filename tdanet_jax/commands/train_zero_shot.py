@@ -44,11 +44,14 @@ def check(command: Command) -> TrainConfig:
         given = dataclasses.replace(
             command, run=TrainConfig(), devices=1, log=(), tensorboard=False
         )
-        new = dataclasses.replace(TrainConfig().with_budget(config), data=config.data)
+        new = dataclasses.replace(
+            TrainConfig().with_budget(config), data=config.data, word_vectors=config.word_vectors
+        )
         if given != Command(run=TrainConfig(), resume=command.resume) or config != new:
             fail(
                 "--resume continues a run as it began: it takes a new budget (--steps, --episodes, "
-                "--minutes), the new place of its rooms (--data), --devices and --log alone"
+                "--minutes), the new place of its rooms (--data) and of its word vectors "
+                "(--word-vectors), --devices and --log alone"
             )
         from tdanet_jax.workflows.train import resumed
 

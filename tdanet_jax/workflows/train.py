@@ -45,8 +45,8 @@ def train(
     """Trains a run to the end of its budget, evaluates it in the test rooms, and writes its report.
 
     Args:
-      config: the run. With `resume`, only its budget counts, as the run's new one, and `data`, the
-        new place of the run's rooms; None keeps the run's own.
+      config: the run. With `resume`, only its budget counts, as the run's new one, and `data` and
+        `word_vectors`, the new places of the run's files; None keeps the run's own.
       folder: where everything is written; new or empty, unless `resume`.
       resume: continue the run in `folder` from its newest checkpoint, bit for bit.
       device_count: devices to split the environments over, in this process.
@@ -131,10 +131,11 @@ def train_together(members: Sequence[tuple[TrainConfig, Path | str]], callbacks:
 
 
 def resumed(folder: Path | str, new: TrainConfig | None = None) -> TrainConfig:
-    """The configuration of the run in a folder, with the budget and the rooms of another if any.
+    """The configuration of the run in a folder, with the budget and the files of another if any.
 
     Raises:
-      ValueError: the folder holds no run, or nothing to continue from.
+      ValueError: the folder holds no run, or nothing to continue from; or it has the bundled
+        word vectors, and the other has not.
     """
     folder = Path(folder)
     config = configs.load(folder / CONFIG_FILE)
@@ -144,6 +145,12 @@ def resumed(folder: Path | str, new: TrainConfig | None = None) -> TrainConfig:
         config = config.with_budget(new)
     if new is not None and new.data is not None:
         config = dataclasses.replace(config, data=new.normalised().data)
+    if new is not None and new.word_vectors is not None:
+        if config.word_vectors is None:
+            raise ValueError(
+                f"--word-vectors {new.word_vectors}: {folder} was trained with the bundled ones"
+            )
+        config = dataclasses.replace(config, word_vectors=new.normalised().word_vectors)
     config.check()
     return config
 

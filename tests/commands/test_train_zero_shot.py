@@ -13,7 +13,10 @@ from pathlib import Path
 import pytest
 
 import tdanet_jax
+from tdanet_jax import config as configs
 from tdanet_jax.commands import evaluate, train_zero_shot
+from tdanet_jax.commands.running import parse_command
+from tdanet_jax.config import TrainConfig
 from tdanet_jax.io import files
 from tdanet_jax.training import run_file
 from tdanet_jax.training.checkpoint import Checkpoints
@@ -149,6 +152,14 @@ def test_a_split_of_ones_own_is_trained_evaluated_and_gone_on_with(
     assert agent.config.split == "Mug,CD,Towel"
     known = {agent.classes.names[i] for i in agent.classes.known}
     assert set(agent.classes.names) - known == unseen
+
+
+def test_the_advice_for_word_vectors_that_were_moved_can_be_followed(tmp_path):
+    run, vectors = tmp_path / "run", tmp_path / "vectors.npz"
+    run.mkdir()
+    configs.save(TrainConfig(word_vectors="gone.npz"), run / "config.json")
+    arguments = ["--resume", str(run), "--word-vectors", str(vectors)]
+    assert train_zero_shot.check(parse_command(arguments)).word_vectors == str(vectors)
 
 
 #: All that an agent may sense beyond the paper.

@@ -155,6 +155,19 @@ def test_results_of_a_former_budget_are_not_those_of_a_longer_run(
     ]
 
 
+def test_a_run_is_resumed_with_the_new_places_of_its_files(tmp_path: Path) -> None:
+    own = dataclasses.replace(CONFIG, data=None, word_vectors=str(tmp_path / "moved.npz"))
+    configs.save(own, tmp_path / CONFIG_FILE)
+    new = TrainConfig(steps=5, word_vectors=str(tmp_path / "here.npz"), seed=7)
+    budget = {"minutes": None, "steps": 5}
+    expected = dataclasses.replace(own, **budget, word_vectors=new.word_vectors)  # type: ignore[arg-type]
+    assert resumed(tmp_path, new) == expected
+    assert resumed(tmp_path, TrainConfig()) == own
+    configs.save(CONFIG, tmp_path / CONFIG_FILE)
+    with pytest.raises(ValueError, match=r"here.npz: .* was trained with the bundled ones"):
+        resumed(tmp_path, new)
+
+
 class Shielding(Callbacks):
     """Knows whether a signal would have to wait."""
 
