@@ -316,10 +316,14 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
       runs: seeds of one configuration and task that share their pools, with a budget in steps.
 
     Raises:
-      ValueError: too many updates of a run were skipped; its state is saved first.
+      ValueError: too many updates of a run were skipped; the states of all are saved first.
     """
     try:
         yield from _chunks_together(runs)
+    except ValueError:
+        for run in runs:
+            run.save()
+        raise
     finally:
         runs[0].pools.close()
 

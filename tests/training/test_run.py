@@ -206,6 +206,20 @@ def test_a_run_that_is_no_longer_finite_stops_with_its_state_saved(task, tmp_pat
     assert not (tmp_path / "history").exists()  # none was asked for
 
 
+def test_seeds_trained_together_are_all_saved_when_one_is_no_longer_finite(task, tmp_path):
+    config = dataclasses.replace(TINY, max_skipped=4, history=0)
+    runs = []
+    for seed in (0, 1):
+        (tmp_path / str(seed)).mkdir()
+        own, shared = dataclasses.replace(config, seed=seed), runs[0].pools if runs else None
+        runs.append(Run(tmp_path / str(seed), own, task, pools=shared))
+    broken = jax.tree.map(lambda leaf: leaf * np.nan, runs[0].state.params)
+    runs[0].state = runs[0].state.replace(params=broken)
+    with pytest.raises(ValueError, match="4 updates skipped"):
+        list(chunks_together(runs))
+    assert [run.checkpoints.latest() for run in runs] == [4, 4]
+
+
 def test_the_learning_rate_falls_linearly_from_the_first_update_on(whole):
     """A row has the mean of its two updates, at 0 and 1, 2 and 3, ... of 16 in all."""
     shares = (np.arange(0, 16, 2) + 0.5) / 16
