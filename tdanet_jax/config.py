@@ -40,7 +40,11 @@ TRUST = "TDANET_TRUST"
 
 @dataclasses.dataclass(frozen=True)
 class LearnerConfig(Settings):
-    """The update's hyperparameters; `--preset paper` has those of the reference implementation."""
+    """The update's hyperparameters.
+
+    `--preset paper` has those of the reference implementation, except for `rollout_steps`: that
+    code updates after every episode, of at most 30 steps.
+    """
 
     num_envs: int = 64
     """Environments that step together (B)."""
@@ -239,7 +243,8 @@ class TrainConfig(Settings):
     `tdanet evaluate --history`; 0 keeps none. A point of TDANet takes 12 MB."""
     max_skipped: int = 20
     """Stop after this many skipped updates since the start or --resume. An update is skipped if its
-    loss or gradient is not finite."""
+    loss or gradient is not finite; of several optimiser steps, only the faulty ones are left out,
+    and the update counts as skipped."""
     learner: LearnerConfig = dataclasses.field(default_factory=LearnerConfig)
     """Settings of the update."""
     network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)
@@ -398,10 +403,11 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
         "not be negative",
     ),
     (
-        ("steps", "episodes", "minutes", "checkpoint_minutes", "max_skipped"),
+        ("steps", "minutes", "checkpoint_minutes", "max_skipped"),
         lambda value: value <= 1e15,
         "be at most 1e15",
     ),
+    (("episodes",), lambda value: value < 2**31, f"be at most {2**31 - 1:,}"),  # an int32 counts
     (
         (
             "num_envs", "rollout_steps", "num_minibatches", "update_epochs", "step_limit",
@@ -423,6 +429,25 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
         "be 0, or from 1/256 to 255/256",
     ),
 )  # fmt: skip
+
+
+def idle_flags(config: TrainConfig) -> dict[str, str]:
+    """Flags of training that are set but change nothing, each with the reason."""
+    default, learner = TrainConfig(), config.learner
+    pools = not (config.variants or config.generated), "without --variants or --generated"
+    idle = {
+        "clip_coef": (learner.optimizer_steps == 1, "with one optimiser step per update"),
+        "imitation_until": (not learner.imitation_weight, "without --imitation-weight"),
+        "pool_rooms": pools,
+        "pool_updates": pools,
+    }
+    values = {**vars(config), **vars(learner)}
+    defaults = {**vars(default), **vars(default.learner)}
+    return {
+        f"--{name.replace('_', '-')}": reason
+        for name, (is_idle, reason) in idle.items()
+        if is_idle and values[name] != defaults[name]
+    }
 
 
 def run_name(config: TrainConfig) -> str:

@@ -46,6 +46,7 @@ def test_paper_preset_has_the_reference_constants():
         (TrainConfig(generated=1, generated_only=True, variants=1), "not with --variants"),
         (TrainConfig(steps=0), "--steps 0"),
         (TrainConfig(minutes=-1.0), "--minutes -1.0"),
+        (TrainConfig(episodes=2**31), "--episodes 2147483648: must be at most 2,147,483,647"),
         (TrainConfig(steps=10**400), "--steps 1000"),
         (TrainConfig(network=NetworkConfig(width=10**9)), "--width 1000000000: must be at most"),
         (TrainConfig(learner=LearnerConfig(step_limit=2**40)), "--step-limit 1099511627776"),
@@ -218,6 +219,37 @@ def test_of_several_budgets_the_one_that_is_spent_first_counts(budget, share):
 
 def test_a_paper_run_ends_with_the_first_of_its_budgets():
     assert dataclasses.replace(PAPER, steps=100).spent(100, 3, 1.0) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("config", "idle"),
+    [
+        (TrainConfig(), {}),
+        (
+            TrainConfig(learner=LearnerConfig(clip_coef=0.1, imitation_until=1.0)),
+            {
+                "--clip-coef": "with one optimiser step per update",
+                "--imitation-until": "without --imitation-weight",
+            },
+        ),
+        (
+            TrainConfig(
+                learner=LearnerConfig(
+                    clip_coef=0.1, update_epochs=2, imitation_until=1.0, imitation_weight=0.1
+                )
+            ),
+            {},
+        ),
+        (
+            TrainConfig(pool_rooms=9, pool_updates=9),
+            dict.fromkeys(["--pool-rooms", "--pool-updates"], "without --variants or --generated"),
+        ),
+        (TrainConfig(pool_rooms=9, variants=1), {}),
+        (TrainConfig(pool_updates=9, generated=1), {}),
+    ],
+)
+def test_flags_that_change_nothing_are_named_with_the_reason(config, idle):
+    assert configs.idle_flags(config) == idle
 
 
 def test_a_run_of_a_custom_model_is_read_only_by_those_who_trust_it(tmp_path, monkeypatch):

@@ -83,10 +83,11 @@ def train(
     lists = episodes.load(task.tables, task.split, task.extras)  # errors show before training
     if not resume:
         check_trained(config, task.model)
-    for flag in () if resume else unused_flags(config, task.classes):
-        callbacks.on_note(f"note: {flag} changes nothing for {config.model}")
-    if idle := idle_rooms(task.tables, task.split):
-        callbacks.on_note(f"note: no target can be found in {name_ranges(idle)}: left out")
+        idle = dict.fromkeys(unused_flags(config, task.classes), f"for {config.model}")
+        for flag, reason in {**idle, **configs.idle_flags(config)}.items():
+            callbacks.on_note(f"note: {flag} changes nothing {reason}")
+    if rooms := idle_rooms(task.tables, task.split):
+        callbacks.on_note(f"note: no target can be found in {name_ranges(rooms)}: left out")
     # What "auto" means here is part of the run: it continues with the same products elsewhere.
     config = resolve(config)
     with files.locked(folder) if devices.is_lead() else contextlib.nullcontext():

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from tdanet_jax.config import TrainConfig
+import pytest
+
+from tdanet_jax.config import LearnerConfig, NetworkConfig, TrainConfig
 from tdanet_jax.training.callbacks import Callbacks
 from tdanet_jax.workflows import train
 
@@ -56,3 +59,27 @@ def test_a_seed_that_catches_up_is_saved_and_shown() -> None:
     assert shown.runs == [[second]] * 4 + [[first, second]] * 4
     # At first, after every second chunk, and in the end.
     assert (first.saved, second.saved) == (6, 6)
+
+
+@pytest.mark.usefixtures("ithor")
+def test_flags_that_change_nothing_are_noted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Noting(Callbacks):
+        def on_note(self, text: str) -> None:
+            said.append(text)
+
+    def begin(*arguments: Any) -> None:
+        raise ValueError("begun")
+
+    said: list[str] = []
+    monkeypatch.setattr(train, "Run", begin)
+    config = TrainConfig(
+        learner=LearnerConfig(clip_coef=0.1), network=NetworkConfig(inner_rate=1e-3)
+    )
+    with pytest.raises(ValueError, match="begun"):
+        train.train(config, tmp_path / "run", callbacks=Noting())
+    assert said == [
+        "note: --inner-rate changes nothing for tdanet",
+        "note: --clip-coef changes nothing with one optimiser step per update",
+    ]
