@@ -37,8 +37,8 @@ class LSTM(nn.Module):
     """A long short-term memory (Hochreiter and Schmidhuber 1997), as torch.nn.LSTMCell.
 
     Gates i, f, g, o = sigmoid, sigmoid, tanh, sigmoid of [x, skip_inputs, h] W + b_ih + b_hh. The
-    rows of W for the few `skip_inputs` are a separate kernel, which keeps the sizes of the large
-    product round.
+    few `skip_inputs` are inputs like x, those that skip the encoder. Their rows of W are a separate
+    kernel, which keeps the sizes of the large product round.
     """
 
     features: int

@@ -10,7 +10,6 @@ import dataclasses
 from collections.abc import Mapping
 
 import jax
-import jax.numpy as jnp
 
 from tdanet_jax.config import TrainConfig
 from tdanet_jax.models.actor_critic import ActorCritic
@@ -45,8 +44,7 @@ class Count:
 
 def count(model: ActorCritic, classes: int, width: int) -> Count:
     """The parameters of a network for a number of classes with word vectors of a `width`."""
-    words = jax.ShapeDtypeStruct((classes, width), jnp.float32)
-    shapes = jax.eval_shape(model.initialise, jax.random.key(0), words)
+    shapes = model.parameter_shapes(classes, width)
     trained = sum(leaf.size for leaf in jax.tree.leaves(shapes))
     rows = (w.shape[0] for name, w in shapes["lstm"].items() if name.startswith("kernel"))
     return Count(trained, model.encoder.published_extra(width, sum(rows) - model.hidden))

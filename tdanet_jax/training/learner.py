@@ -382,15 +382,15 @@ def update(
 
     now = schedule(config, progress)
     experience = Experience(steps, advantage, state.recurrent.carry)
-    learning = functools.partial(learn, now=now, config=config, model=model, words=words)
+    take_step = functools.partial(learn, now=now, config=config, model=model, words=words)
     if config.optimizer_steps == 1:
-        weights, opt_state, metrics = learning(state.params, state.opt_state, experience)
+        weights, opt_state, metrics = take_step(state.params, state.opt_state, experience)
     else:
         parts = minibatches(experience, config.num_minibatches)
 
-        def body(learnt: tuple[Any, Any], index: jax.Array) -> tuple[tuple[Any, Any], Any]:
+        def body(before: tuple[Any, Any], index: jax.Array) -> tuple[tuple[Any, Any], Any]:
             part = jax.tree.map(lambda x: x[index], parts)
-            weights, opt_state, metrics = learning(*learnt, part)
+            weights, opt_state, metrics = take_step(*before, part)
             return (weights, opt_state), metrics
 
         order = jnp.arange(config.optimizer_steps) % config.num_minibatches
