@@ -11,7 +11,7 @@ from tdanet_jax import sense_noise
 from tdanet_jax.config import TrainConfig, check_seed, find_word_vectors, with_decisions
 from tdanet_jax.decisions import OWN_DECISIONS, Decisions
 from tdanet_jax.sense_noise import SenseNoise
-from tdanet_jax.settings import Settings, fits
+from tdanet_jax.settings import Settings
 from tdanet_jax.splits import OF_VALIDATION, OPEN
 from tdanet_jax.targets import canonical, known_classes, naming, parse
 
@@ -54,14 +54,15 @@ class EvalConfig(Settings):
           policy: how actions are chosen; "greedy" has no temperature.
           seed: of sampled actions.
         """
+        self.check_types()
         self.decisions.check()
         if policy == "greedy" and self.decisions.temperature is not None:
             raise ValueError("--temperature: has no effect on --policy greedy")
         if seed is not None:
             check_seed(seed)
         for name, value in (("step-limit", self.step_limit), ("episodes", self.episodes)):
-            if value is not None and (not fits(value, int) or value < 1):
-                raise ValueError(f"--{name} {value}: must be a positive integer")
+            if value is not None and value < 1:
+                raise ValueError(f"--{name} {value}: must be positive")
         if self.step_limit is not None and self.step_limit > 1_000_000:
             raise ValueError(f"--step-limit {self.step_limit}: must be at most 1,000,000")
         if self.test_targets is not None:
@@ -80,6 +81,7 @@ class EvalConfig(Settings):
         values = {name: getattr(self, name) for name in ("step_limit", "episodes")}
         values["training_rooms"] = self.training_rooms
         values |= {name: list(getattr(self, name)) for name in ("scenes", "targets")}
+        values["word_vectors"] = self.word_vectors
         if self.senses.any:
             values["noise"] = str(self.senses)
         return {name: value for name, value in values.items() if value} | self.decisions.replaced

@@ -1,23 +1,24 @@
-"""Frozen dataclasses of settings, and the types of their values. Imports neither JAX nor NumPy."""
+"""The base of dataclasses of settings: plain values, checked types. Imports no NumPy and no JAX."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import numbers
+import os
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Base of dataclasses of settings. Numbers of other types, as NumPy's, become Python's own."""
+    """Base of dataclasses of settings. NumPy's and JAX's numbers become Python's, paths text."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, numbers.Real) and not isinstance(value, bool):
-                plain = int(value) if isinstance(value, numbers.Integral) else float(value)
-                object.__setattr__(self, field.name, plain)
+            if getattr(value, "shape", None) == ():
+                object.__setattr__(self, field.name, value.item())
+            elif isinstance(value, os.PathLike):
+                object.__setattr__(self, field.name, os.fspath(value))
 
     def check_types(self) -> None:
         """Raises ValueError, with one line that names the flag, if a value is not of its type."""
@@ -45,7 +46,7 @@ def in_words(kind: Any, value: Any) -> str:
     if get_origin(kind) is Literal:
         return f"one of {', '.join(map(str, get_args(kind)))}"
     if get_origin(kind) is tuple:
-        return "a tuple of strings"
+        return "a tuple of strings"  # the only one that there is
     if get_args(kind):  # float | None
         return in_words(get_args(kind)[0], value)
     if kind is float and type(value) is float and not math.isfinite(value):

@@ -1,12 +1,13 @@
-"""Numbers of any type are taken as Python's own; other values are named with the type they lack."""
+"""NumPy's numbers and paths are taken; other values are refused, with the type they must have."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -20,13 +21,17 @@ def test_numbers_of_other_types_become_plain_ones() -> None:
     config = TrainConfig(
         seed=np.int64(3),  # type: ignore[arg-type]
         minutes=np.float32(0.5),  # type: ignore[arg-type]
-        learner=LearnerConfig(gamma=Fraction(1, 2), num_envs=np.uint8(8)),  # type: ignore[arg-type]
+        validation=np.True_,  # type: ignore[arg-type]
+        data=Path("rooms.npz"),  # type: ignore[arg-type]
+        learner=LearnerConfig(gamma=jnp.float32(0.5), num_envs=np.array(8)),  # type: ignore[arg-type]
         network=NetworkConfig(dropout=np.float64(0.25)),
     )
     config.check()
     plain = TrainConfig(
         seed=3,
         minutes=0.5,
+        validation=True,
+        data="rooms.npz",
         learner=LearnerConfig(gamma=0.5, num_envs=8),
         network=NetworkConfig(dropout=0.25),
     )
@@ -62,6 +67,9 @@ def test_numbers_of_other_types_become_plain_ones() -> None:
         (NetworkConfig, {"scores": 1}, "--scores 1: must be True or False"),
         (NetworkConfig, {"sensors": (3,)}, "--sensors (3,): must be a tuple of strings"),
         (Decisions, {"temperature": "1"}, "--temperature 1: must be a number"),
+        (EvalConfig, {"scenes": "FloorPlan1"}, "--scenes FloorPlan1: must be a tuple of strings"),
+        (EvalConfig, {"training_rooms": "no"}, "--training-rooms no: must be True or False"),
+        (EvalConfig, {"step_limit": 2.5}, "--step-limit 2.5: must be a whole number"),
         (Decisions, {"done_bias": float("inf")}, "--done-bias inf: must be finite"),
     ],
 )

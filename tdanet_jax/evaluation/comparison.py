@@ -64,12 +64,10 @@ class _Test(NamedTuple):
     split: str
     targets: str
     data_version: str
-    data: str | None
 
 
 def _test(result: Result) -> _Test:
-    targets = result.get("targets") or PAPER
-    return _Test(result["split"], targets, result["data_version"], result["data"])
+    return _Test(result["split"], result.get("targets") or PAPER, result["data_version"])
 
 
 class _Kind(NamedTuple):
@@ -190,7 +188,7 @@ def _same_episodes(
     """Whether two networks have the same starts and targets in the same rooms."""
     ours, theirs = played[one], played[other]
     return (
-        all(results[one][name] == results[other][name] for name in ("split", "data_version"))
+        _test(results[one]) == _test(results[other])
         and ours.keys() == theirs.keys()
         and all(
             np.array_equal(ours[group][name], theirs[group][name])
@@ -243,8 +241,7 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
       results: as `saved_networks.Evaluated.results` gives them.
       runs: a short name for each; points of one run, which are not averaged, share one.
     """
-    # All are played alike, but some may have other word vectors than their own.
-    departures = next((found for r in results if (found := r.get("departures"))), None)
+    departures = common_departures(results)
     where = rooms_played(departures, [result["split"] for result in results])
     lines = [
         f"# {in_markdown(title)}",
@@ -270,14 +267,15 @@ def markdown(title: str, results: Sequence[Result], runs: Sequence[str]) -> str:
         lines += ["", f"## Split {test.split}", ""]
         if test.targets not in (PAPER, OPEN):
             lines += [f"Targets: {in_markdown(test.targets)}.", ""]
-        if len({(of.data_version, of.data) for of in tests}) > 1:
-            rooms = "the bundled ones" if test.data is None else in_markdown(test.data)
+        data = own[0]["data"]
+        if len({of.data_version for of in tests}) > 1:
+            rooms = "the bundled ones" if data is None else in_markdown(data)
             lines += [f"Rooms: {rooms}, scene tables {test.data_version}.", ""]
         lines += table(("Agent", "Updates", "Training episodes", "Actions"), rows)
         if differing:
             lines += ["", "Differences: in the same episodes, 95 % intervals (paired bootstrap)."]
         if published:
-            lines += ["", paper.worlds(test.data)]
+            lines += ["", paper.worlds(data)]
     return "\n".join(lines) + "\n"
 
 
@@ -314,6 +312,15 @@ def _means(results: Sequence[Result], names: Sequence[str]) -> Iterator[_Row]:
                 (f"**{in_markdown(label)}, {len(seeds)} seeds**", "", "", seeds[0]["policy"]),
                 summary(seeds),
             )
+
+
+def common_departures(results: Iterable[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """How results that were played alike depart from the official test.
+
+    They can only differ in word vectors, which are no departure of an agent that was trained with
+    them (`SavedNetwork.departures`).
+    """
+    return max((r.get("departures") or {} for r in results), key=len, default=None) or None
 
 
 class Curve(NamedTuple):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ from flax import traverse_util
 
 from tdanet_jax import config as configs
 from tdanet_jax import words
-from tdanet_jax.config import CONFIG_FILE, WORD_VECTORS_FILE, TrainConfig
+from tdanet_jax.config import CONFIG_FILE, WORD_VECTORS_FILE, NetworkConfig, TrainConfig
 from tdanet_jax.eval_config import OWN_TASK, EvalConfig
 from tdanet_jax.evaluation import comparison, policies, report, rollout, selection
 from tdanet_jax.evaluation.report import Played
@@ -37,6 +38,7 @@ from tdanet_jax.training import history
 from tdanet_jax.training.checkpoint import Checkpoints, is_shared, newest
 from tdanet_jax.training.history import Snapshot
 
+_DEFAULT = NetworkConfig()
 #: Networks in one call on an accelerator, at most; bounds the memory. A CPU plays one after the
 #: other, so there each has a call of its own, and progress can be reported.
 TOGETHER = 20
@@ -58,26 +60,37 @@ class SavedNetwork:
 
     @property
     def departures(self) -> dict[str, Any]:
-        """`EvalConfig.departures`, and the word vectors if they are not those of the training."""
-        own = self.config.word_vectors is not None and not os.path.lexists(
-            self.run / WORD_VECTORS_FILE
-        )  # then `--word-vectors` says where a file is that the run holds no copy of
-        words = {} if own or self.test.word_vectors is None else {
-            "word_vectors": self.test.word_vectors
-        }  # fmt: skip
-        return self.test.departures | words
+        """`EvalConfig.departures`, without word vectors that are those of the training."""
+        found = self.test.departures
+        if self.config.word_vectors and not os.path.lexists(self.run / WORD_VECTORS_FILE):
+            found.pop("word_vectors", None)  # it says where the file is that the run has no copy of
+        return found
+
+    @property
+    def data_version(self) -> str:
+        """The version of the scene tables of the rooms and targets that it is evaluated in."""
+        located = self.located
+        with naming("--targets" if self.test.test_targets is None else "--test-targets"):
+            tables, _ = find_targets(located.sought, load_rooms(located.data), located.validation)
+        return tables.data_version
 
     def load(self) -> Snapshot:
         """Reads the network. Raises ValueError if it cannot be read."""
         return newest(self.run) if self.point is None else history.read(self.point)
 
     def fingerprint(self, snapshot: Snapshot) -> str:
-        """Twelve digits that tell this agent from others: its network, and how it sees and decides.
+        """Twelve hexadecimal digits: of its network, what it is shown, how it decides, its split.
+
+        Settings at their default values do not count, so that agents keep theirs when further ones
+        are added.
 
         Args:
           snapshot: its network, from `load`.
         """
-        digest = hashlib.sha256(str(dataclasses.replace(_task_config(self), data=None)).encode())
+        config = _task_config(self)
+        network = {k: v for k, v in vars(config.network).items() if v != getattr(_DEFAULT, k)}
+        told = (config.split, config.targets, config.model, config.word_vectors, network)
+        digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
         arrays = traverse_util.flatten_dict(jax.device_get(snapshot.weights), sep="/")
         for name, array in sorted(arrays.items()):
             digest.update(f"{name} {array.shape} {array.dtype}".encode())

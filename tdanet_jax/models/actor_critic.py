@@ -15,8 +15,8 @@ from tdanet_jax.models.activation_cache import ACTIVATIONS
 from tdanet_jax.models.encoder import Encoder
 from tdanet_jax.models.layers import Linear
 from tdanet_jax.models.lstm import LSTM, Carry
-from tdanet_jax.models.operands import OPERANDS, rounded
 from tdanet_jax.models.reach import ReachEstimate, mask_done
+from tdanet_jax.models.rounding import ROUNDED_TO, rounded
 from tdanet_jax.observation_spec import ObservationSpec
 from tdanet_jax.sensors import suite
 from tdanet_jax.vocabulary import NUM_ACTIONS, Action
@@ -188,12 +188,12 @@ def prepare(model: ActorCritic, weights: Any, words: jax.Array) -> Any:
     return model.apply({"params": weights}, words, method="prepare")
 
 
-def round_kernels(model: ActorCritic, weights: Any, words: jax.Array, least: int) -> Any:
-    """The parameters with the kernels that the network's layers would round at every step, rounded.
+def round_kernels(model: ActorCritic, weights: Any, words: jax.Array, above: int) -> Any:
+    """The parameters, with the kernels rounded that the network's layers round at every step.
 
     Args:
       words: word vectors [C, D].
-      least: kernels of no more numbers stay as they are.
+      above: only kernels with more numbers than this; for others, it would save nothing.
     """
 
     def step(module: ActorCritic, words: jax.Array, state: RecurrentState) -> None:
@@ -202,10 +202,10 @@ def round_kernels(model: ActorCritic, weights: Any, words: jax.Array, least: int
 
     def ask(weights: Any, words: jax.Array) -> Any:
         state = initial_state(model, weights, 1)
-        return nn.apply(step, model, mutable=[OPERANDS])({"params": weights}, words, state)[1]
+        return nn.apply(step, model, mutable=[ROUNDED_TO])({"params": weights}, words, state)[1]
 
-    found = jax.eval_shape(ask, weights, words).get(OPERANDS, {})
-    return rounded(weights, found, least)
+    dtypes = jax.eval_shape(ask, weights, words).get(ROUNDED_TO, {})
+    return rounded(weights, dtypes, above)
 
 
 def initial_state(

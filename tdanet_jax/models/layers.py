@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from tdanet_jax.models import operands
+from tdanet_jax.models import rounding
 from tdanet_jax.models.activation_cache import dense_product
 
 #: The Flax collection of per-environment weights, which are added to the parameters of dense
@@ -29,7 +29,7 @@ class Linear(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         """[..., n] -> [..., features]."""
         kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
-        operands.declare(self, "kernel", self.dtype)
+        rounding.declare(self, "kernel", self.dtype)
         y = dense_product(self, x, kernel, self.dtype)
         if self.use_bias:
             y += self.param("bias", nn.initializers.zeros, (self.features,))

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from tdanet_jax.models import operands
+from tdanet_jax.models import rounding
 from tdanet_jax.models.activation_cache import ACTIVATIONS
 from tdanet_jax.models.matmul import dot, materialized_transpose, pack, product, unpack
 
@@ -66,7 +66,7 @@ class LSTM(nn.Module):
 
         gates = 4 * self.features
         kernel = self.param("kernel", uniform, (x.shape[-1] + self.features, gates))
-        operands.declare(self, "kernel", self.dtype)
+        rounding.declare(self, "kernel", self.dtype)
         kernel_skip = jnp.zeros((0, gates))
         if skip_inputs.shape[-1]:  # a checkpoint takes no empty array
             kernel_skip = self.param("kernel_skip", uniform, (skip_inputs.shape[-1], gates))

@@ -316,11 +316,12 @@ def chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
       runs: seeds of one configuration and task that share their pools, with a budget in steps.
 
     Raises:
-      ValueError: too many updates of a run were skipped; the states of all are saved first.
+      ValueError: too many updates of a run were skipped, or its rooms cannot be made; the states of
+        all are saved first.
     """
     try:
         yield from _chunks_together(runs)
-    except ValueError:
+    except Exception:
         for run in runs:
             run.save()
         raise
@@ -351,12 +352,7 @@ def _chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
     for run in runs:
         run._open_journal()
     while lead.progress < 1.0:
-        try:
-            changed = [run._change_rooms() for run in runs]
-        except Exception:
-            for run in runs:
-                run.save()
-            raise
+        changed = [run._change_rooms() for run in runs]
         if any(changed):
             stacked = together()
         arguments = lead._words, lead.pools.params

@@ -16,7 +16,7 @@ from typing import Any
 from tdanet_jax import sense_noise
 from tdanet_jax.analysis import figures
 from tdanet_jax.eval_config import OWN_TASK, EvalConfig, describe_departures, rooms_played
-from tdanet_jax.evaluation import metrics, report, results_file, saved_networks
+from tdanet_jax.evaluation import comparison, metrics, report, results_file, saved_networks
 from tdanet_jax.evaluation.metrics import MEASURES
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
 from tdanet_jax.io import files
@@ -24,7 +24,6 @@ from tdanet_jax.io.escaping import in_markdown
 from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.sense_noise import SWEEP_FILE
 from tdanet_jax.splits import GROUPS, OF_VALIDATION
-from tdanet_jax.task import load_task
 from tdanet_jax.workflows.evaluate import short_names
 
 Row = dict[str, Any]
@@ -94,7 +93,7 @@ def evaluate_noise(
             files.write_text(folder / "noise.md", markdown(ordered))
             configs = [level.network.config for level in levels]
             splits = [config.split + OF_VALIDATION * config.validation for config in configs]
-            where = rooms_played(ordered[0]["departures"], splits)
+            where = rooms_played(comparison.common_departures(ordered), splits)
             figures.noise(ordered, f"Senses that err, {where}", folder / "noise.png")
     return ordered
 
@@ -171,7 +170,7 @@ def _there(path: Path, levels: Sequence[_Level], same: Mapping[str, Row]) -> dic
             raise FileError(path, f"holds {what}, which is not asked for; choose another --out")
         level = levels[i := heads.index(head)]
         if (agent := level.row["agent"]) not in versions:
-            versions[agent] = load_task(level.network.located).tables.data_version
+            versions[agent] = level.network.data_version
         expected = {**same[agent], "data_version": versions[agent]}
         if differing := [name for name, value in expected.items() if row.get(name) != value]:
             raise FileError(
@@ -240,8 +239,8 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
         f"code {report.code_version()}. In percent, L >= 1; in brackets, the share of the same "
         "agent's figure without noise. " + metrics.COLLISION_FREE,
     ]
-    if first["departures"]:
-        lines += ["", f"**{in_markdown(describe_departures(first['departures']))}.**"]
+    if departures := comparison.common_departures(rows):
+        lines += ["", f"**{in_markdown(describe_departures(departures))}.**"]
     if first.get("test_targets") is not None:
         lines += ["", f"Targets: {in_markdown(first['test_targets'])}."]
     heads = ["Level", "Agent", *(f"{group} {m}" for group in GROUPS for m in MEASURES)]

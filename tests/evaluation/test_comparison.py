@@ -83,9 +83,16 @@ def test_the_page_says_which_targets_were_tested():
 def test_other_tests_stand_in_other_tables():
     """Other rooms, or other targets: neither side by side nor in one mean."""
     houses = result(2, 20.0) | {"data": "house.npz", "data_version": "h"}
+    copy = result(4, 25.0) | {"data": "copy/house.npz", "data_version": "h"}
     some = result(3, 30.0) | {"targets": "Mug,Vase"}
-    page = comparison.markdown("Four", [result(0), houses, some, result(1)], "abcd")
-    paper, house, few = page.split("## Split 18/4")[1:]
+    results = [result(0), houses, some, result(1), copy]
+    results = [r | {"run": name} for r, name in zip(results, "abcde", strict=True)]
+    played = [records(range(3), [True, False, True]) for _ in results]
+    found = comparison.with_differences(results, played)
+    others = [r["difference"] and r["difference"]["to"] for r in found]
+    assert others == [None, None, None, "a", "b"]
+    page = comparison.markdown("Five", found, "abcde")
+    _, paper, house, few = page.split("## Split 18/4")
     assert "**tdanet, 2 seeds**" in paper
     assert "| TDANet (paper) |" in paper
     assert "Rooms: the bundled ones, scene tables d." in paper
@@ -93,7 +100,10 @@ def test_other_tests_stand_in_other_tables():
     assert "| b | 0 |" in house
     assert "Targets: Mug,Vase." in few
     assert "(paper)" not in few
-    assert "seeds**" not in house + few
+    assert "| e minus b |" in house
+    assert "| d minus a |" in paper
+    assert "minus" not in few
+    assert "seeds**" not in few
 
 
 def test_a_history_is_not_averaged_over_its_points():
