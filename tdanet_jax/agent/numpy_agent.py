@@ -92,6 +92,7 @@ class Target(NamedTuple):
 
     query: np.ndarray  # [F + D] float32, whose product with a row is its attention logit
     reference: np.ndarray  # [width] float32, the target's branch of the Siamese comparison
+    context: np.ndarray  # [context // 2] float32, what the context says of the target
 
 
 class NumPyAgent(BaseAgent):
@@ -198,7 +199,10 @@ class NumPyAgent(BaseAgent):
             query = self.weights["encoder/attention/kernel"] @ self._layer(
                 "encoder/attention", inputs
             )
-            self._targets[row] = Target(query, self._branch(inputs))
+            context = np.zeros(0, np.float32)
+            if self.meta.context:
+                context = _relu(self._layer("encoder/scene_context/target", self._word(row)))
+            self._targets[row] = Target(query, self._branch(inputs), context)
         return self._targets[row]
 
     def _encode(
@@ -214,16 +218,15 @@ class NumPyAgent(BaseAgent):
         third = _relu(self._layer("encoder/linear3", difference))
         features = _relu(self._layer("encoder/linear4", third))
         if self.meta.context:
-            features = np.concatenate([features, self._context(goal, inputs)])
+            features = np.concatenate([features, self._context(inputs), target.context])
         return attention, features
 
-    def _context(self, goal: int, inputs: np.ndarray) -> np.ndarray:
-        """The features of `models.context`, from the rows [n, F + D] of a frame."""
+    def _context(self, inputs: np.ndarray) -> np.ndarray:
+        """What `models.context` says of the rows [n, F + D] of a frame."""
+        if not len(inputs):
+            return np.zeros(2 * self.meta.context, np.float32)
         rows = _relu(self._layer("encoder/scene_context/detection", inputs))
-        target = _relu(self._layer("encoder/scene_context/target", self._word(goal)))
-        if not len(rows):
-            rows = np.zeros((1, self.meta.context), np.float32)
-        return np.concatenate([rows.max(axis=0), rows.mean(axis=0), target])
+        return np.concatenate([rows.max(axis=0), rows.mean(axis=0)])
 
     def _reach(self, sensors: numpy_sensors.States) -> float:
         """How probable it is that the target, being in view, is within reach (`models.reach`)."""

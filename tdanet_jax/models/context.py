@@ -13,13 +13,13 @@ from flax import linen as nn
 from flax import struct
 
 from tdanet_jax.env.types import Observation
-from tdanet_jax.models.layers import Linear, look_up
+from tdanet_jax.models.layers import Linear, by_part, look_up
 
 
 class ContextTable(struct.PyTreeNode):
     """The products with word vectors, by class."""
 
-    names: jax.Array  # [C, U], of a detection's name
+    names: jax.Array  # [C, U], of a detection's name, bias included
     boxes: jax.Array  # [F, U], of a unit of x, y, S and the score
     targets: jax.Array  # [C, U // 2], of the target's name, after its ReLU
 
@@ -45,14 +45,8 @@ class SceneContext(nn.Module):
 
     def prepare(self, words: jax.Array) -> ContextTable:
         """What depends on class names alone, from their word vectors [C, D]."""
-        columns, inputs = self.columns, words.shape[1] + self.columns
-        bias = self.detection(jnp.zeros((1, inputs)))
-        # The layer of a row is the sum over its parts.
-        return ContextTable(
-            names=self.detection(jnp.pad(words, ((0, 0), (columns, 0)))),  # bias included
-            boxes=self.detection(jnp.eye(columns, inputs)) - bias,
-            targets=nn.relu(self.target(words)),
-        )
+        names, boxes = by_part(self.detection, words, self.columns)
+        return ContextTable(names, boxes, targets=nn.relu(self.target(words)))
 
     def __call__(self, table: ContextTable, obs: Observation) -> jax.Array:
         """The features of a batch of observations, [..., 2 U + U // 2]."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -52,6 +53,25 @@ class Linear(nn.Module):
             gate: Any = self.get_variable(PER_ENVIRONMENT, "gate")
             y = jnp.where(gate.reshape(-1, *(1,) * (y.ndim - 1)), y, 0.0)
         return y
+
+
+def by_part(
+    layer: Callable[[jax.Array], jax.Array], words: jax.Array, columns: int
+) -> tuple[jax.Array, jax.Array]:
+    """What a dense layer makes of each part of a row [box, word]; a row's is the sum of its parts'.
+
+    Args:
+      layer: [..., F + D] -> [..., n], with a bias.
+      words: [C, D].
+      columns: F, numbers of the box.
+
+    Returns:
+      Of each word, bias included [C, n]; of a unit of each number of the box [F, n].
+    """
+    width = columns + words.shape[1]
+    bias = layer(jnp.zeros((1, width)))
+    units = layer(jnp.eye(columns, width)) - bias
+    return layer(jnp.pad(words, ((0, 0), (columns, 0)))), units
 
 
 def look_up(table: jax.Array, index: jax.Array) -> jax.Array:

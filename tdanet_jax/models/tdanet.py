@@ -27,7 +27,7 @@ from tdanet_jax.models.actor_critic import ActorCritic
 from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.context import ContextTable, SceneContext
 from tdanet_jax.models.encoder import Encoder
-from tdanet_jax.models.layers import Linear, look_up, look_up_in_rows
+from tdanet_jax.models.layers import Linear, by_part, look_up, look_up_in_rows
 
 #: Centre, area and score in the target's row, before its word vector.
 TARGET_BOX = (0.5, 0.5, 0.25, 1.0)
@@ -90,9 +90,7 @@ class TDANetEncoder(Encoder):
         if self.target_attention:
             queries = self.attention(targets)  # [C, H]
             # W_L of a row is the sum over its parts, and so are the logits.
-            bias = self.attention(jnp.zeros((1, words.shape[1] + columns)))
-            units = self.attention(jnp.eye(columns, words.shape[1] + columns)) - bias  # [F, H]
-            names = self.attention(jnp.pad(words, ((0, 0), (columns, 0))))  # [C, H], bias included
+            names, units = by_part(self.attention, words, columns)
             class_logits, box_logits = queries @ names.T, queries @ units.T
         context = self.scene_context.prepare(words) if self.context else None
         return ClassTable(words, class_logits, box_logits, self.branch(targets), context)
