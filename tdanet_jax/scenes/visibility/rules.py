@@ -52,8 +52,9 @@ class Rules:
     # Inset: meshes do not fill their boxes; solids are smaller by this share on every side.
     inset: float = 0.05
 
-    # Structure: parts of the building, which hide things and are never detections. A wall is inset
-    # in its thickness alone. The box of a door that is not shut is a hole in the wall around it.
+    # Structure: parts of the building, which hide things and are never detections. They are inset
+    # in their thickness alone. The box of a door that is not shut is a hole in the wall around it,
+    # unless it has swung out of the wall.
     walls: frozenset[str] = WALLS
     doors: frozenset[str] = DOORS
 

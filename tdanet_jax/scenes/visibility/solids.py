@@ -130,26 +130,29 @@ def solids_of(scene: Scene, rules: Rules) -> Solids:
     """The occluding boxes of a room."""
     aligned = [(box, OPEN) for box in void_boxes(scene, rules)]
     turned = []
+    passages = passages_of(scene, rules)
     for item in scene.objects:
-        if item.object_class in rules.see_through or _is_passage(item, rules):
+        if item.object_class in rules.see_through or item in passages:
             continue
         closed = item.object_class in rules.closed and not item.is_open
         kind, inset = (CLOSED, 0.0) if closed else (OPEN, rules.inset)
         origin, edges = box_frame(item.box, item.corners)
         lengths = np.sqrt((edges * edges).sum(axis=1))
-        is_wall = item.object_class in rules.walls
+        is_structure = item.object_class in rules.structure
         if item.object_class in rules.plates:
             box = item.box.copy()
             box[0, 1] = max(box[0, 1], box[1, 1] - rules.thickness)
             aligned.append((box, kind))
         elif np.sort(np.abs(edges))[:, 1].max() <= THIN:  # along the world's axes
-            if is_wall:
-                aligned += [(box, kind) for box in wall_boxes(item, scene, rules)]
-                continue
             rim = inset * (item.box[1] - item.box[0])
-            aligned.append((item.box + np.stack([rim, -rim]), kind))
+            if is_structure:
+                rim *= np.arange(3) == _across(item.box)
+            boxes = [item.box + np.stack([rim, -rim])]
+            if item.object_class in rules.walls:
+                boxes = wall_boxes(item, boxes[0], passages, scene, rules)
+            aligned += [(box, kind) for box in boxes]
         else:
-            insets = inset * (lengths == lengths.min()) if is_wall else inset
+            insets = inset * (lengths == lengths.min()) if is_structure else inset
             turned.append((origin + edges.sum(axis=0) / 2, edges, lengths, insets, kind))
     boxes = [box for box, _ in aligned]
     boxes += [np.stack([-lengths, lengths]) * (0.5 - inset) for _, _, lengths, inset, _ in turned]
@@ -170,46 +173,66 @@ def solids_of(scene: Scene, rules: Rules) -> Solids:
     )
 
 
-def _is_passage(item: SceneObject, rules: Rules) -> bool:
-    """Whether it is a doorway without a door, or with an open one."""
-    has_door = item.openable or item.object_class == "Door"
-    return item.object_class in rules.doors and (item.is_open or not has_door)
+def passages_of(scene: Scene, rules: Rules) -> list[SceneObject]:
+    """The open doors of a room, and its doorways without a door: a closed one shuts its frame."""
+    doors = [item for item in scene.objects if item.object_class in rules.doors]
+    leaves = [item for item in doors if item.openable or item.object_class == "Door"]
+    shut = [leaf.box for leaf in leaves if not leaf.is_open]
+    frames = [item for item in doors if item not in leaves]
+    return [leaf for leaf in leaves if leaf.is_open] + [
+        frame for frame in frames if not any(_share_place(frame.box, box).all() for box in shut)
+    ]
 
 
-def wall_boxes(wall: SceneObject, scene: Scene, rules: Rules) -> list[np.ndarray]:
-    """Boxes [2, 3] of a wall along x or z, without the passages through its middle.
+def _share_place(box: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Along each axis, whether the middle of the shorter of two boxes is within the longer: [3]."""
+    apart = np.abs(box.mean(axis=0) - other.mean(axis=0))
+    return apart <= np.maximum(np.ptp(box, axis=0), np.ptp(other, axis=0)) / 2 + THIN
+
+
+def _across(box: np.ndarray) -> int:
+    """The axis, 0 or 2, along which a part of the building is thin."""
+    x, _, z = box[1] - box[0]
+    return 0 if x <= z else 2
+
+
+def wall_boxes(
+    wall: SceneObject, inset: np.ndarray, passages: list[SceneObject], scene: Scene, rules: Rules
+) -> list[np.ndarray]:
+    """The parts [2, 3] of a wall's `inset` box [2, 3] that no passage through it opens.
 
     Nor is there a wall around the points in its box, as in a doorway that is not among the objects.
     """
-    size = wall.box[1] - wall.box[0]
-    across = 0 if size[0] <= size[2] else 2
-    middle, along = wall.box[:, across].mean(), 2 - across
-    rim = rules.inset * size * (np.arange(3) == across)
-    holes = [
-        (*item.box[:, along], item.box[1, 1])
-        for item in scene.objects
-        if _is_passage(item, rules)
-        and item.box[0, across] - THIN <= middle <= item.box[1, across] + THIN
-    ]
+    across = _across(wall.box)
+    along = 2 - across
+    holes = []
+    for item in passages:
+        size = item.box[1] - item.box[0]
+        # A door that has swung out is beside the wall, or perpendicular to it.
+        if _share_place(wall.box, item.box)[across] and size[across] <= 2 * size[along]:
+            holes.append(item.box)
     at = scene.points
     inside = ((wall.box[0] <= at) & (at <= wall.box[1]))[:, [0, 2]].all(axis=1)
-    holes += [(x - rules.standing, x + rules.standing, np.inf) for x in at[inside, along]]
-    boxes = [wall.box + np.stack([rim, -rim])]
+    radius = max(rules.standing, scene.grid.grid_size / 2)
+    reach = np.array([radius, np.inf, radius])
+    holes += [np.stack([point - reach, point + reach]) for point in at[inside]]
+    boxes = [inset]
     for hole in holes:
-        boxes = [piece for box in boxes for piece in _around_hole(box, along, *hole)]
+        boxes = [piece for box in boxes for piece in _around_hole(box, hole, (along, 1))]
     return boxes
 
 
-def _around_hole(
-    box: np.ndarray, along: int, low: float, high: float, top: float
-) -> list[np.ndarray]:
-    """A box without what is between `low` and `high` along an axis, and below `top`."""
-    before, beyond, above = box.copy(), box.copy(), box.copy()
-    before[1, along] = min(low, box[1, along])
-    beyond[0, along] = max(high, box[0, along])
-    above[:, along] = np.clip((low, high), *box[:, along])
-    above[0, 1] = max(top, box[0, 1])
-    return [piece for piece in (before, beyond, above) if (piece[0] < piece[1])[[1, along]].all()]
+def _around_hole(box: np.ndarray, hole: np.ndarray, axes: tuple[int, int]) -> list[np.ndarray]:
+    """The parts of a box that are before or beyond a hole along one axis, or else the other."""
+    if not (np.maximum(box[0], hole[0]) + THIN < np.minimum(box[1], hole[1]))[[*axes]].all():
+        return [box]
+    pieces, middle = [], box.copy()
+    for axis in axes:
+        before, beyond = middle.copy(), middle.copy()
+        middle[:, axis] = np.clip(hole[:, axis], *middle[:, axis])
+        before[1, axis], beyond[0, axis] = middle[:, axis]
+        pieces += [piece for piece in (before, beyond) if np.ptp(piece[:, axis]) > THIN]
+    return pieces
 
 
 def unit_of(scene: Scene) -> int:

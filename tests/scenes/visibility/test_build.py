@@ -164,7 +164,11 @@ def seen_from(scene: Scene) -> list[int]:
 
 
 WALL = toy.thing("Wall", (0.0, 1.25, 0.6), (4.0, 2.5, 0.1))
+BACK = toy.thing("Wall", (0.0, 1.25, 0.5), (4.0, 2.5, 0.1), number=1)
 DOORWAY = toy.thing("Doorway", (0.1, 1.0, 0.6), (1.0, 2.0, 0.2))
+FRAME = toy.thing("Doorframe", (0.48, 1.0, 0.6), (1.0, 2.0, 0.2))
+DOOR = toy.thing("Door", (0.48, 1.0, 0.6), (1.0, 2.0, 0.04))
+OPEN_DOOR = dataclasses.replace(DOOR, is_open=True)
 
 
 def test_what_is_behind_a_wall_is_seen_through_its_doors_alone() -> None:
@@ -180,6 +184,19 @@ def test_what_is_behind_a_wall_is_seen_through_its_doors_alone() -> None:
         # Beside the line of sight; and in another wall, although in front of this one.
         ((WALL, toy.thing("Doorway", (1.0, 1.0, 0.6), (1.0, 2.0, 0.2))), [3]),
         ((WALL, toy.thing("Doorway", (0.0, 1.0, 0.45), (1.0, 2.0, 0.25))), [3]),
+        # On another storey.
+        ((WALL, toy.thing("Doorway", (0.1, 4.0, 0.6), (1.0, 2.0, 0.2))), [3]),
+        # A frame with its door, at whose jamb one would see the mug.
+        ((WALL, FRAME, DOOR), [3]),
+        ((FRAME, DOOR), [3]),
+        ((WALL, FRAME, OPEN_DOOR), [0, 1, 2, 3]),
+        # A doorway between the walls of two rooms, back to back, is thinner than both.
+        ((BACK, WALL, toy.thing("Doorway", (0.1, 1.0, 0.55), (1.0, 2.0, 0.06))), [0, 1, 2, 3]),
+        # Open doors without a frame: in the wall, beside it, and at right angles to it.
+        ((WALL, OPEN_DOOR), [0, 1, 2, 3]),
+        ((WALL, toy.thing("Door", (0.1, 1.0, 0.68), (0.9, 1.9, 0.04), is_open=True)), [3]),
+        ((WALL, toy.thing("Door", (0.0, 1.0, 1.05), (0.04, 1.9, 0.9), is_open=True)), [3]),
+        ((WALL, toy.thing("Door", (0.0, 1.0, 1.0), (0.04, 1.9, 0.9), is_open=True)), [3]),
     ):
         scene = house_with(*structure)
         assert seen_from(scene) == expected, structure
@@ -188,8 +205,11 @@ def test_what_is_behind_a_wall_is_seen_through_its_doors_alone() -> None:
 
 
 def test_a_wall_is_whole_but_for_its_doors_and_where_an_agent_stands() -> None:
-    def spans(*others: SceneObject, spots: np.ndarray | None = None) -> list[list[list[float]]]:
-        solids = solids_of(house_with(WALL, *others, spots=spots), BARE)
+    def spans(
+        *others: SceneObject, spots: np.ndarray | None = None, size: float = 0.25
+    ) -> list[list[list[float]]]:
+        scene = house_with(WALL, *others, spots=spots)
+        solids = solids_of(dataclasses.replace(scene, grid=PoseGrid(size)), BARE)
         boxes = np.stack([solids.lo, solids.hi], axis=1)
         thick = np.ptp(boxes[:, :, 2], axis=1) == 90  # 0.1 m but for 5 % on both sides
         return sorted(boxes[thick][:, :, :2].tolist())
@@ -198,8 +218,14 @@ def test_a_wall_is_whole_but_for_its_doors_and_where_an_agent_stands() -> None:
     assert spans() == whole
     door = [[[-2000, 0], [-400, 2500]], [[-400, 2000], [600, 2500]], [[600, 0], [2000, 2500]]]
     assert spans(DOORWAY) == door
+    hatch = toy.thing("Doorway", (0.1, 1.5, 0.6), (1.0, 1.0, 0.2))
+    below = [[-400, 0], [600, 1000]]
+    assert spans(hatch) == [door[0], below, *door[1:]]
+    assert spans(toy.thing("Doorway", (0.1, 4.0, 0.6), (1.0, 2.0, 0.2))) == whole
     inside = toy.points((0.0, 0.0), (0.5, 0.6))
     assert spans(spots=inside) == [[[-2000, 0], [300, 2500]], [[700, 0], [2000, 2500]]]
+    coarse = toy.points((0.0, 0.6), (0.5, 0.6))
+    assert spans(spots=coarse, size=0.5) == [[[-2000, 0], [-250, 2500]], [[750, 0], [2000, 2500]]]
     turned_wall = dataclasses.replace(WALL, box=WALL.box[:, [2, 1, 0]])
     lo, hi = (getattr(solids_of(house_with(turned_wall), BARE), side) for side in ("lo", "hi"))
     assert [555, 0, -2000] in lo.tolist()
