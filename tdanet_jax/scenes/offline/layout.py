@@ -64,7 +64,8 @@ def find_root(folder: Path) -> Path:
       FileError: there is none, or there are several at the same level.
     """
     for pattern in ("*", "*/*", "*/*/*"):
-        roots = sorted({place.parent for place in folder.glob(pattern) if _is_scene(place)})
+        found = sorted({place.parent for place in folder.glob(pattern) if _is_scene(place)})
+        roots = [*{root.resolve(): root for root in found}.values()]  # a link is no other folder
         if len(roots) > 1:
             listed = ", ".join(str(root.relative_to(folder)) for root in roots)
             raise FileError(folder, f"rooms in several folders; import one of them: {listed}")

@@ -398,6 +398,10 @@ def test_folders_without_scenes(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="one of them: a/test, a/train"):
         layout.find_root(tmp_path)
     assert layout.find_root(tmp_path / "a" / "train") == tmp_path / "a" / "train"
+    (tmp_path / "b").mkdir()
+    for name in ("data", "offline_data"):
+        (tmp_path / "b" / name).symlink_to(tmp_path / "a" / "train")
+    assert layout.find_root(tmp_path / "b").resolve() == tmp_path / "a" / "train"
     original.write_room(tmp_path / "a" / "Lab")
     with pytest.raises(FileError, match="no room to import; Lab: left out, --room-type or --rooms"):
         layout.find_scenes(layout.find_root(tmp_path))
