@@ -36,7 +36,7 @@ MODULES = (
     *cache.MODULES,
     *(f"scenes.{name}" for name in ("house", "metadata")),
     *(f"scenes.offline.{name}" for name in ("layout", "object_ids", "frames", "matching",
-                                            "reader")),
+                                            "reader", "importer")),
 )  # fmt: skip
 #: Share of the frame's width or height from which a box comes near its border.
 NEAR = 0.9
