@@ -60,7 +60,11 @@ class Import:
         check_new_file(self.out)
         kinds, frame = self._kinds(), self._frame()
         maps, maps_out = None, features.features_path(self.out)
-        check_new_file(maps_out)  # or else the new rooms would take them for theirs
+        if maps_out.exists():  # the new rooms would take them for theirs
+            fail(
+                f"--out {self.out}: there are feature maps of earlier rooms, {maps_out}; "
+                "remove them or choose another name"
+            )
         if self.features and self.source is not None:
             maps = features.find_features(self.source, kinds)
         remove_abandoned(self.out, maps_out)
