@@ -104,9 +104,8 @@ class Counters:
                              (middle + half, 0.915, z + depth / 2)),
             self._room.block("SinkBasin", (middle - 0.8 * half, 0.925 - height, z - 0.37 * depth),
                              (middle + 0.8 * half, 0.9, z + 0.33 * depth)),
+            self._faucet(middle, z - 0.37 * depth),
         ]  # fmt: skip
-        if "Faucet" in self._room.library:
-            found.append(self._faucet(middle, z - 0.37 * depth))
         return found + [
             self._front("Cabinet", at + k * width / 2, width / 2, 0.1, 0.64) for k in range(2)
         ]

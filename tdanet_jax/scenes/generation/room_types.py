@@ -14,7 +14,7 @@ from tdanet_jax.scenes.placement import LEVEL
 
 #: What is built in, and not generated: a counter in a bedroom.
 BUILT_IN = ("Cabinet", "CounterTop", "Drawer")
-#: What is built in; the known rooms have all of these.
+#: What is built in. The known rooms must have all that is built into kitchens.
 IN_KITCHENS = ("Cabinet", "CounterTop", "Drawer", "Faucet", "Fridge", "Sink", "SinkBasin",
                "StoveBurner", "StoveKnob")  # fmt: skip
 IN_BATHROOMS = ("Bathtub", "BathtubBasin", "Cabinet", "CounterTop", "Drawer", "Faucet",

@@ -29,7 +29,8 @@ class Generator:
         """`scenes` are the known rooms: training rooms alone, for rooms to train in.
 
         Raises:
-          SceneError: they are not rooms of all of iTHOR's types, or lack what is built in.
+          SceneError: they are not rooms of all of iTHOR's types, or there is no piece of a kind
+            that is built into kitchens.
         """
         self._usual = statistics(scenes, ON_FURNITURE)
         self._catalogue = catalogue.load()
