@@ -119,7 +119,7 @@ def read_scene(path: Path) -> None:
 
 
 def read_pickle(path: Path) -> None:
-    extras.read_episodes(path, {"FloorPlan21": extras.KnownRoom(GRID, {"Mug"})})
+    extras.read_episodes(path, {"FloorPlan21": extras.ImportedRoom(GRID, {"Mug"}, "kitchen")})
 
 
 def read_matrix(path: Path) -> None:

@@ -37,25 +37,26 @@ GRAPH_CLASSES, GRAPH_MATRIX = "objects.txt", "adjmat.dat"
 TARGET_FILE = "targets.json"
 
 
-class KnownRoom(NamedTuple):
-    """What an episode must fit."""
+class ImportedRoom(NamedTuple):
+    """What the extras must fit."""
 
     grid: Grid
     classes: Collection[str]
-    room_type: str = ROOM_TYPES[0]
+    room_type: str
 
 
 def read_extras(
-    folders: Iterable[Path], rooms: Mapping[str, KnownRoom], own: Collection[Path] = ()
+    folders: Iterable[Path], rooms: Mapping[str, ImportedRoom], own: Collection[Path] = ()
 ) -> tuple[Extras, list[str]]:
     """Each of the extras from the first folder that has it, and lines on each.
 
     Args:
+      folders: where to look for all of them but `targets.json`.
+      rooms: the imported scenes by name; episodes that do not fit them are left out.
       own: the folders in which a `targets.json` is of these rooms: others use the name, too.
-      rooms: the imported scenes; episodes that do not fit them are left out.
 
     Raises:
-      FileError: a file is broken.
+      FileError: a file is broken, or `targets.json` does not fit the rooms.
     """
     places = list(folders)
     parents, adjacency = _first(places, PARENT_FILE), _first(places, GRAPH_FOLDER)
@@ -173,7 +174,7 @@ def read_graph(names_path: Path, matrix_path: Path) -> tuple[tuple[str, ...], np
 
 
 def read_episodes(
-    path: Path, rooms: Mapping[str, KnownRoom]
+    path: Path, rooms: Mapping[str, ImportedRoom]
 ) -> tuple[list[PublishedEpisode], dict[str, list[str]]]:
     """The episodes of `<room>_<test|val>.pkl` that fit the rooms, and all others, by reason.
 
@@ -198,7 +199,7 @@ def read_episodes(
     return found, others
 
 
-def _misfit(episode: PublishedEpisode, room: KnownRoom | None) -> str | None:
+def _misfit(episode: PublishedEpisode, room: ImportedRoom | None) -> str | None:
     """Why an episode cannot be used, or None if it can."""
     if room is None:
         return "in rooms that were not imported"

@@ -18,7 +18,7 @@ from tdanet_jax.io.untrusted import FileError, npz
 from tdanet_jax.scenes import cache
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.offline import frames, layout
-from tdanet_jax.scenes.offline.extras import KnownRoom, read_extras
+from tdanet_jax.scenes.offline.extras import ImportedRoom, read_extras
 from tdanet_jax.scenes.offline.features import load_features as load_features  # its former place
 from tdanet_jax.scenes.offline.frames import Frame
 from tdanet_jax.scenes.offline.layout import Grid, Report, SceneFolder, find_root, find_scenes
@@ -70,7 +70,7 @@ def read_folder(
         report(len(rooms) / len(chosen), line)
     _warn_of_borders(rooms)
     known = {
-        scene.name: KnownRoom(Grid(room.position), frozenset(room.classes), scene.room_type)
+        scene.name: ImportedRoom(Grid(room.position), frozenset(room.classes), scene.room_type)
         for scene, room in zip(chosen, rooms, strict=True)
     }
     # The reference keeps its test episodes two folders above the scenes.

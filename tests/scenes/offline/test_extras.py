@@ -17,7 +17,7 @@ from tdanet_jax.evaluation import episodes
 from tdanet_jax.io.untrusted import FileError
 from tdanet_jax.scenes.dataset import Rooms
 from tdanet_jax.scenes.offline import extras, importer
-from tdanet_jax.scenes.offline.extras import KnownRoom
+from tdanet_jax.scenes.offline.extras import ImportedRoom
 from tdanet_jax.task import make_task
 from tdanet_jax.vocabulary import ROOM_TYPES
 from tdanet_jax.words import WordVectors
@@ -162,7 +162,7 @@ class Command:
         return os.system, (f"touch {self.made}",)
 
 
-def test_broken_episodes(tmp_path: Path, known: dict[str, KnownRoom]) -> None:
+def test_broken_episodes(tmp_path: Path, known: dict[str, ImportedRoom]) -> None:
     path, made = tmp_path / "kitchen_test.pkl", tmp_path / "made"
     with original.fake_torch():
         [good] = original.episodes([("FloorPlan1", 0.25, 90, "Mug")])
@@ -192,12 +192,12 @@ def test_broken_episodes(tmp_path: Path, known: dict[str, KnownRoom]) -> None:
 
 
 @pytest.fixture
-def known(rooms: Rooms) -> dict[str, KnownRoom]:
-    return {"FloorPlan1": KnownRoom(extras.Grid(rooms.tables.position[:3]), {"Mug"})}
+def known(rooms: Rooms) -> dict[str, ImportedRoom]:
+    return {"FloorPlan1": ImportedRoom(extras.Grid(rooms.tables.position[:3]), {"Mug"}, "kitchen")}
 
 
 def test_episodes_that_do_not_fit_are_left_out_and_named(
-    tmp_path: Path, known: dict[str, KnownRoom]
+    tmp_path: Path, known: dict[str, ImportedRoom]
 ) -> None:
     listed = [
         ("FloorPlan1", 0.25, 90, "Mug"),
