@@ -34,6 +34,8 @@ IMAGE_SIZE = 300  # pixels, width and height of a frame
 IGNORED = frozenset({"Ceiling", "Floor", "Room"})
 #: Classes that are parts of the building: they hide things, and are never detections.
 WALLS, DOORS = frozenset({"Wall"}), frozenset({"Door", "Doorframe", "Doorway"})
+#: All that is never a detection, nor a target.
+STRUCTURE = IGNORED | WALLS | DOORS
 
 ROOM_TYPES = ("kitchen", "living_room", "bedroom", "bathroom")
 

@@ -21,14 +21,12 @@ from tdanet_jax.labels import Labels
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.vocabulary import (
     ACTION_NAMES,
-    DOORS,
     FIELD_OF_VIEW,
-    IGNORED,
     IMAGE_SIZE,
     VISIBILITY_DISTANCE,
-    WALLS,
     Action,
 )
+from tdanet_jax.vocabulary import STRUCTURE as STRUCTURE  # its former place
 
 
 def settings(grid: PoseGrid = ITHOR) -> dict[str, Any]:
@@ -47,9 +45,6 @@ def settings(grid: PoseGrid = ITHOR) -> dict[str, Any]:
 
 #: Those of iTHOR's rooms.
 SETTINGS = settings()
-
-#: Object types that are parts of the building; the rooms in which agents are trained have none.
-STRUCTURE = IGNORED | WALLS | DOORS
 
 #: What AI2-THOR's LookUp and LookDown tilt the camera by, unless they are told.
 LOOK_DEGREES = 30

@@ -45,7 +45,7 @@ from tdanet_jax.scenes.room_names import Kinds, RoomKind, check_kind, check_name
 from tdanet_jax.scenes.scene import MOST_OBJECTS, MOST_POINTS, Scene, SceneError, SceneObject
 from tdanet_jax.scenes.visibility.geometry import next_positions
 from tdanet_jax.splits import in_order, is_plain, known_type
-from tdanet_jax.vocabulary import IGNORED
+from tdanet_jax.vocabulary import IGNORED, STRUCTURE
 
 ALIGNED = 0.02  # metres by which a point may miss the grid
 SKEW = 0.02  # metres by which corners may miss those of a box
@@ -283,7 +283,10 @@ def _targets(scene: str, document: Mapping[str, Any]) -> tuple[str, ...]:
     names = document.get("targets", [])
     if not isinstance(names, list) or not all(isinstance(n, str) and is_plain(n) for n in names):
         raise SceneError(f"{scene}: targets is not a list of names of classes")
-    return in_order(map(_known, names))
+    found = in_order(map(_known, names))
+    if parts := ", ".join(name for name in found if name in STRUCTURE):
+        raise SceneError(f"{scene}: targets: parts of the building are never targets: {parts}")
+    return found
 
 
 def _rooms(scene: str, document: Mapping[str, Any]) -> list[house.Room]:

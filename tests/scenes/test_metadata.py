@@ -227,6 +227,11 @@ CASES = [
     (["horizons"], 30, "Lab: horizons is not a list"),
     (["targets"], "Mug", "Lab: targets is not a list of names of classes"),
     (["targets"], ["a;b"], "Lab: targets is not a list of names of classes"),
+    (
+        ["targets"],
+        ["mug", "Doorway"],
+        "Lab: targets: parts of the building are never targets: Doorway",
+    ),
     (["horizons"], [], r"Lab: horizons \[\]: must be whole degrees"),
     (["horizons"], [0, [30]], "Lab: horizons .*: must be whole degrees"),
     (["agent"], 3, None),  # as every field that is not listed

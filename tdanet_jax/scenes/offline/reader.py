@@ -22,7 +22,7 @@ from tdanet_jax.scenes.offline.object_ids import UNKNOWN, class_of, is_id, place
 from tdanet_jax.scenes.scene import MOST_OBJECTS, MOST_POINTS, SUBPIXEL, Scene, SceneError
 from tdanet_jax.scenes.visibility.build import Detections
 from tdanet_jax.scenes.visibility.geometry import transitions
-from tdanet_jax.vocabulary import IGNORED, IMAGE_SIZE
+from tdanet_jax.vocabulary import IMAGE_SIZE, STRUCTURE
 
 #: Pixels by which a box may leave the frame, to which it is then clipped.
 OVERHANG = 1.0
@@ -199,7 +199,7 @@ def read_visibility(path: Path, grid: Grid) -> Objects:
     objects = Objects()
     for name, value in jsons.members(path):
         if isinstance(value, list):
-            if class_of(name) in IGNORED:
+            if class_of(name) in STRUCTURE:
                 continue
             objects.add(path, name, class_of(name), place_in(name))
             objects.states[name] |= {grid.state(path, key) for key in value}
@@ -220,7 +220,7 @@ def _add_record(path: Path, key: str, objects: Objects, record: Any, state: int)
     named = name and object_class and isinstance(visible, bool)
     if not named or not isinstance(name, str) or not isinstance(object_class, str):
         raise FileError(path, f"{key}: an object without objectId, objectType or visible")
-    if object_class in IGNORED:
+    if object_class in STRUCTURE:
         return
     if name not in objects.classes:
         objects.add(path, name, object_class, _event_box(path, name, fields))
@@ -263,7 +263,7 @@ def read_objects(path: Path, grid: Grid, objects: Objects) -> dict[int, list[str
     for name, record in records.items():
         if not isinstance(record, Mapping) or not isinstance(record.get("objectType"), str):
             raise FileError(path, f"{name}: no objectType")
-        if record["objectType"] not in IGNORED:
+        if record["objectType"] not in STRUCTURE:
             kept.add(name)
             objects.add(path, name, record["objectType"], _extent(path, name, record))
     owners = {}
@@ -312,7 +312,7 @@ def read_boxes(
             {
                 name: _boxes(path, key, name, flat, frame)
                 for name, flat in groups.items()
-                if (class_of(name) if is_id(name) else name) not in IGNORED
+                if (class_of(name) if is_id(name) else name) not in STRUCTURE
             },
         )
 

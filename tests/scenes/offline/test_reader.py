@@ -166,18 +166,21 @@ def test_boxes_of_events_say_where_objects_are(folder: Path) -> None:
             assert mug.box.tolist() == expected
 
 
-def test_floors_are_left_out_of_every_file(folder: Path) -> None:
+@pytest.mark.parametrize("part", ["Floor", "Wall", "Doorway"])
+def test_parts_of_the_building_are_left_out_of_every_file(folder: Path, part: str) -> None:
     before = read(folder)
-    floor = "Floor|+00.00|+00.00|+00.00"
+    floor = f"{part}|+00.00|+00.00|+00.00"
     change(folder, "visible_object_map.json", lambda seen: seen.update({floor: KEYS}))
-    change(folder, "objects_bb.json", lambda boxes: boxes[KEYS[0]].update(Floor=[0, 200, 300, 300]))
+    change(
+        folder, "objects_bb.json", lambda boxes: boxes[KEYS[0]].update({part: [0, 200, 300, 300]})
+    )
     assert rows(read(folder)) == rows(before)
     named = {KEYS[0]: {floor: [0, 200, 300, 300], MUG: [1, 1, 2, 2]}}
     change(folder, "objects_bb.json", lambda _: named)
-    assert [item for _, item, _, _ in rows(read(folder)) if "Floor" in item] == []
-    change(folder, "objects_bb.json", lambda _: {KEYS[0]: {"Floor": [0] * 4, "Mug": [1, 1, 2, 2]}})
+    assert [item for _, item, _, _ in rows(read(folder)) if part in item] == []
+    change(folder, "objects_bb.json", lambda _: {KEYS[0]: {part: [0] * 4, "Mug": [1, 1, 2, 2]}})
     records = {
-        floor: {"objectType": "Floor", "box": None}, MUG: {"objectType": "Mug", "box": None}
+        floor: {"objectType": part, "box": None}, MUG: {"objectType": "Mug", "box": None}
     }  # fmt: skip
     ours = {"objects": records, "instances": {KEYS[0]: [0, 1]}}
     (folder / "objects.json").write_text(json.dumps(ours))
@@ -189,7 +192,7 @@ def test_floors_are_left_out_of_every_file(folder: Path) -> None:
         for name in (floor, MUG)
     ]
     (folder / "metadata.json").write_text(json.dumps({KEYS[0]: {"objects": things}}))
-    assert [item for _, item, _, _ in rows(read(folder)) if "Floor" in item] == []
+    assert [item for _, item, _, _ in rows(read(folder)) if part in item] == []
 
 
 def test_the_file_named_with_the_distance_is_preferred(folder: Path) -> None:
