@@ -137,7 +137,7 @@ class TDANetEncoder(Encoder):
         if not self.siamese and not self.target_attention:
             features = jnp.concatenate([features, class_table.words[obs.target]], axis=-1)
         features = nn.relu(self.linear4(nn.relu(self.linear3(features))))
-        if not self.context:
+        if class_table.context is None:
             return features
         seen = self.scene_context(class_table.context, obs)
         return jnp.concatenate([features, seen], axis=-1)
