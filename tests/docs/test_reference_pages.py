@@ -130,7 +130,7 @@ def test_the_readme_gives_the_means_of_three_seeds(split: str) -> None:
 
 
 def test_means_of_the_seeds_with_the_papers_inputs() -> None:
-    paths = ROOT.glob("results/18-4-paper-inputs-half-[012]/results.json")
+    paths = ROOT.glob("results/18-4-paper-inputs-context-[012]/results.json")
     found = [json.loads(path.read_text()) for path in paths]
     assert len(found) == 3
 
