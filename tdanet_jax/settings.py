@@ -10,12 +10,12 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Base of dataclasses of settings. NumPy's and JAX's numbers become Python's, paths text."""
+    """Base of dataclasses of settings. NumPy's numbers become Python's, and paths text."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if getattr(value, "shape", None) == ():
+            if type(value).__module__ == "numpy" and value.shape == ():
                 object.__setattr__(self, field.name, value.item())
             elif isinstance(value, os.PathLike):
                 object.__setattr__(self, field.name, os.fspath(value))

@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -23,7 +22,7 @@ def test_numbers_of_other_types_become_plain_ones() -> None:
         minutes=np.float32(0.5),  # type: ignore[arg-type]
         validation=np.True_,  # type: ignore[arg-type]
         data=Path("rooms.npz"),  # type: ignore[arg-type]
-        learner=LearnerConfig(gamma=jnp.float32(0.5), num_envs=np.array(8)),  # type: ignore[arg-type]
+        learner=LearnerConfig(gamma=np.float32(0.5), num_envs=np.array(8)),  # type: ignore[arg-type]
         network=NetworkConfig(dropout=np.float64(0.25)),
     )
     config.check()

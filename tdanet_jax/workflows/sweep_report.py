@@ -146,13 +146,13 @@ def left_out(report: Report) -> list[str]:
     seeds: dict[tuple[str, str], list[FinishedRun]] = {}
     for label, run in zip(labels(report.runs), report.runs, strict=True):
         seeds.setdefault((run.results["split"], label), []).append(run)
-    for curve, runs in seeds.items():
-        names = ", ".join(run.folder.name for run in runs)
-        points = {run.config.history for run in runs}
-        if len(points) > 1:
-            lines.append(f"Learning curve: the histories of {names} have points in common alone.")
-        elif curve not in drawn:
-            lines.append(f"Learning curve: no history of {names}.")
+    flat = [run.folder.name for curve in seeds if curve not in drawn for run in seeds[curve]]
+    if flat:
+        lines.append(f"Learning curve: no history of {', '.join(flat)}.")
+    for runs in seeds.values():
+        if len({run.config.history for run in runs}) > 1:
+            names = ", ".join(run.folder.name for run in runs)
+            lines.append(f"Learning curve: of {names}, only the points that all have.")
     return lines
 
 

@@ -120,7 +120,7 @@ def test_an_unknown_name_is_one_clear_error(
 @pytest.mark.parametrize("values", [{"step_limit": 0}, {"episodes": -1}, {"step_limit": 1.5}])
 def test_a_value_out_of_range_is_named(values: dict[str, int]) -> None:
     [(name, value)] = values.items()
-    with pytest.raises(ValueError, match=f"--{name.replace('_', '-')} {value}: must be a positive"):
+    with pytest.raises(ValueError, match=f"--{name.replace('_', '-')} {value}: must be "):
         tdanet_jax.evaluate(policy="random", test=EvalConfig(**values))
 
 

@@ -116,6 +116,13 @@ def test_what_was_not_trained_is_left_out_and_named(report):
     page = sweep_report.markdown(report, {})
     assert all(f"- {line}" in page for line in lines)
     assert "tdanet-no-sa |" not in page
+    runs = [
+        dataclasses.replace(run, config=dataclasses.replace(run.config, history=points))
+        for run, points in zip(report.runs, (20, 7, 20), strict=True)
+    ]
+    assert sweep_report.left_out(dataclasses.replace(report, runs=runs))[-1] == (
+        "Learning curve: of 18-4-tdanet-seed0, 18-4-tdanet-seed1, only the points that all have."
+    )
 
 
 def test_the_json_holds_what_the_page_shows(report):
