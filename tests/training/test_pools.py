@@ -6,6 +6,7 @@ import dataclasses
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import chex
 import jax
@@ -69,6 +70,11 @@ def task_of(
     return make_task(TINY, ithor, words.load_bundled(), varied=first, further_pools=loads)
 
 
+#: A run, its turns, the room types it was in, what was loaded, and after how many steps all of its
+#: episodes began again.
+Whole = tuple[Run, list[int], list[str], list[int], list[int]]
+
+
 @pytest.fixture(scope="module")
 def asked() -> list[int]:
     return []
@@ -80,18 +86,22 @@ def task(ithor: SceneTables, asked: list[int]) -> Task:
 
 
 @pytest.fixture(scope="module")
-def whole(
-    task: Task, asked: list[int], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Run, list[int], list[str], list[int]]:
-    """A run that nothing interrupted, its turns, the room types it was in, and what was loaded."""
+def whole(task: Task, asked: list[int], tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    """A run that nothing interrupted."""
     run = Run(tmp_path_factory.mktemp("whole"), TINY, task)
-    turns, types = [], []
+    turns, types, begun, begin_again = [], [], [], run._begin_again
+
+    def counted(*given: Any) -> Any:
+        begun.append(run.steps)
+        return begin_again(*given)
+
+    run._begin_again = counted
     for _ in run.chunks():
         turns.append(run._turn)
         position = np.asarray(run.state.env_state.pose) // run.pools.params.grid.views
         types.append("".join(map(str, np.unique(run.pools.params.position_room[position]))))
     run.save()
-    return run, turns, types, [*asked]
+    return run, turns, types, [*asked], begun
 
 
 def leaves(run: Run) -> list[np.ndarray]:
@@ -100,19 +110,20 @@ def leaves(run: Run) -> list[np.ndarray]:
 
 
 def test_pools_take_turns_and_only_those_that_the_budget_reaches_are_loaded(
-    whole: tuple[Run, list[int], list[str], list[int]],
+    whole: Whole,
 ) -> None:
-    _, turns, types, loaded = whole
+    _, turns, types, loaded, begun = whole
     assert turns == [0, 0, 1, 1, 2, 2, 3, 3]
     assert types == ["0", "0", "1", "1", "2", "2", "0", "0"]
     assert loaded == [1, 2]
+    assert begun == [160, 320, 480]  # where they change, episodes of the former ones end
 
 
 @pytest.mark.parametrize(
     "stop", [2, *(pytest.param(stop, marks=pytest.mark.slow) for stop in (1, 3, 4, 6))]
 )
 def test_a_run_goes_on_bit_for_bit_in_the_rooms_that_it_was_in(
-    whole: tuple[Run, list[int], list[str], list[int]], task: Task, tmp_path: Path, stop: int
+    whole: Whole, task: Task, tmp_path: Path, stop: int
 ) -> None:
     begun = Run(tmp_path, TINY, task)
     for count, _ in enumerate(begun.chunks(), start=1):
@@ -331,7 +342,7 @@ def test_turns_are_whole_chunks_and_one_pool_has_no_turns(task: Task) -> None:
 
 
 def test_keys_of_new_episodes_are_those_of_no_update(
-    whole: tuple[Run, list[int], list[str], list[int]],
+    whole: Whole,
 ) -> None:
     run = whole[0]
     model, params = run.model, run.pools.params
@@ -347,7 +358,7 @@ def test_keys_of_new_episodes_are_those_of_no_update(
 
 
 def test_targets_of_new_episodes_have_not_been_seen(
-    whole: tuple[Run, list[int], list[str], list[int]],
+    whole: Whole,
 ) -> None:
     run = whole[0]
     learning = dataclasses.replace(TINY.learner, imitation_weight=0.3)
