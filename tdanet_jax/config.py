@@ -243,8 +243,8 @@ class TrainConfig(Settings):
     `tdanet evaluate --history`; 0 keeps none. A point of TDANet takes 12 MB."""
     max_skipped: int = 20
     """Stop after this many skipped updates since the start or --resume. An update is skipped if its
-    loss or gradient is not finite; of several optimiser steps, only the faulty ones are left out,
-    and the update counts as skipped."""
+    loss or gradient is not finite. If it has several optimiser steps, only those that are not
+    finite are left out, and it counts as skipped."""
     learner: LearnerConfig = dataclasses.field(default_factory=LearnerConfig)
     """Settings of the update."""
     network: NetworkConfig = dataclasses.field(default_factory=NetworkConfig)

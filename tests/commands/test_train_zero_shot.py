@@ -188,7 +188,7 @@ def slurms_variables():
 @pytest.mark.slow
 @pytest.mark.parametrize("who_is_who", [own_variables, slurms_variables])
 def test_two_processes_train_together_and_one_goes_on_alone(who_is_who, ithor, tmp_path):
-    """The environments of one run in two processes, which are stopped and go on; then one goes on.
+    """Two processes share a run's environments, stop, and resume it; then one resumes it alone.
 
     With odometry and triangulation: every environment has a map of its own.
     """

@@ -208,7 +208,7 @@ def wall_boxes(
     holes = []
     for item in passages:
         size = item.box[1] - item.box[0]
-        # A door that has swung out is beside the wall, or perpendicular to it.
+        # The leaf of an open door that has swung out is no hole where it is.
         if _share_place(wall.box, item.box)[across] and size[across] <= 2 * size[along]:
             holes.append(item.box)
     at = scene.points
