@@ -14,13 +14,13 @@ from flax import struct
 
 from tdanet_jax.env.types import Observation
 from tdanet_jax.models.layers import Linear, by_part, look_up
+from tdanet_jax.models.pooling import RowTable, maximum_and_sum
 
 
 class ContextTable(struct.PyTreeNode):
     """The products with word vectors, by class."""
 
-    names: jax.Array  # [C, U], of a detection's name, bias included
-    boxes: jax.Array  # [F, U], of a unit of x, y, S and the score
+    detections: RowTable  # of U units
     targets: jax.Array  # [C, U // 2], of the target's name, after its ReLU
 
 
@@ -46,11 +46,10 @@ class SceneContext(nn.Module):
     def prepare(self, words: jax.Array) -> ContextTable:
         """What depends on class names alone, from their word vectors [C, D]."""
         names, boxes = by_part(self.detection, words, self.columns)
-        return ContextTable(names, boxes, targets=nn.relu(self.target(words)))
+        return ContextTable(RowTable(names, boxes), targets=nn.relu(self.target(words)))
 
     def __call__(self, table: ContextTable, obs: Observation) -> jax.Array:
         """The features of a batch of observations, [..., 2 U + U // 2]."""
-        rows = look_up(table.names, obs.classes) + obs.boxes @ table.boxes
-        rows = jnp.where(obs.mask[..., None], nn.relu(rows), 0.0)
-        mean = rows.sum(-2) / jnp.maximum(obs.mask.sum(-1, keepdims=True), 1)
-        return jnp.concatenate([rows.max(-2), mean, look_up(table.targets, obs.target)], axis=-1)
+        most, total = maximum_and_sum(table.detections, obs)
+        mean = total / jnp.maximum(obs.mask.sum(-1, keepdims=True), 1)
+        return jnp.concatenate([most, mean, look_up(table.targets, obs.target)], axis=-1)
