@@ -49,7 +49,7 @@ class _Rows(NamedTuple):
 
     classes: jax.Array  # [N * K]
     boxes: jax.Array  # [N * K, F]
-    order: jax.Array  # the indices of rows in view, then at least a block of others, N * K
+    order: jax.Array  # [N * K + R], the indices of rows in view, then only N * K; R of a block
     in_view: jax.Array  # how many are
     longest: int  # K
 
@@ -71,7 +71,7 @@ def _block(index: jax.Array, table: RowTable, rows: _Rows, size: int) -> _Block:
 
 
 def _for_each_block(rows: _Rows, body: Any, start: Any) -> Any:
-    """`body(index, size, value)` of each block of rows, one after the other."""
+    """`body(index, R, value)` of each block of R rows, one after the other."""
     size = len(rows.order) - len(rows.classes)
     blocks = -(-rows.in_view // size)
     return jax.lax.fori_loop(0, blocks, lambda index, value: body(index, size, value), start)
