@@ -71,12 +71,13 @@ class Agent(BaseAgent):
         classes: ClassVocabulary | None = None,
         grid: PoseGrid = ITHOR,
         synonyms: Synonyms | Path | str | None = None,
+        more_words: Mapping[str, Sequence[float]] | Path | str | None = None,
     ) -> None:
         self.config = config
         self.classes = ClassVocabulary() if classes is None else classes
         self.model: ActorCritic = make_model(config, self.classes)
         spec = dataclasses.replace(self.model.spec, grid=grid)
-        super().__init__(self.classes.names, vectors, spec, synonyms)
+        super().__init__(self.classes.names, vectors, spec, synonyms, more_words)
         self.weights = jax.device_put(weights)  # NumPy arrays would be copied in each step
         self._table: Any = None
         self._table_rows = 0
@@ -260,10 +261,9 @@ class Agent(BaseAgent):
         return Observation(**arrays), owner
 
     def _prepared(self) -> Any:
-        if self._table is None or self._table_rows != len(self._rows):
-            self._table_rows = len(self._rows)
-            names = [" ".join(key) for key in self._rows]
-            table = self._vectors.table(names, self.config.network.word_norm, blank=True)
+        if self._table is None or self._table_rows != len(self._row_names):
+            self._table_rows, norm = len(self._row_names), self.config.network.word_norm
+            table = np.stack([self._vector(row, norm) for row in range(self._table_rows)])
             rest = -len(table) % LABEL_BLOCK
             self._table = _prepare(self.model, self.weights, np.pad(table, ((0, rest), (0, 0))))
         return self._table
@@ -370,9 +370,7 @@ def load(
     config = with_decisions(config, decisions, run)
     path = find_word_vectors(config, folder_of(run), word_vectors)
     vectors = words.load_word_vectors(path, classes.names)
-    if more_words is not None:
-        vectors = vectors.extended(more_words)
-    agent = Agent(config, weights, vectors, classes, grid, synonyms)
+    agent = Agent(config, weights, vectors, classes, grid, synonyms, more_words)
     shape = max(len(classes.names), 1), vectors.vectors.shape[1]
     expected, width = agent.model.parameter_shapes(*shape), None if path is None else shape[1]
     history.check_fit(run, weights, expected, width)

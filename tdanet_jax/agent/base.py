@@ -63,15 +63,19 @@ class BaseAgent:
         vectors: WordVectors,
         spec: ObservationSpec,
         synonyms: Synonyms | Path | str | None,
+        more_words: Mapping[str, Sequence[float]] | Path | str | None = None,
     ) -> None:
         self.grid: PoseGrid = spec.grid
         self.spec = spec
-        self.labels = Labels(tuple(vectors.described(classes)), vectors.index, synonyms)
-        self._names = tuple(classes)
-        self._vectors = vectors
+        self._own = vectors  # of which its classes keep their vectors, whatever words are added
+        self._described = vectors.described(classes)
         self._synonyms = synonyms
-        self._rows = {class_words(name): i for i, name in enumerate(classes)}
-        self._row_of: dict[str, int] = {}  # by label
+        self._names = tuple(classes)
+        self._row_names = [*classes]  # of the table of classes; then what else labels mean
+        self._rows: dict[tuple[str, ...], int] = {}
+        for row, name in enumerate(classes):
+            self._rows.setdefault(class_words(name), row)
+        self._know(vectors if more_words is None else vectors.extended(more_words))
 
     def start(self, rotation: float = 0, horizon: float = 0, measured: bool = False) -> Any:
         """The state at the start of an episode; see `agent.Agent.start`."""
@@ -123,16 +127,37 @@ class BaseAgent:
         """
         vectors = self._vectors.extended(more)
         added = len(vectors.index) - len(self._vectors.index)
-        named = tuple(vectors.described(self._names))
-        self.labels = Labels(named, vectors.index, self._synonyms)
-        self._vectors, self._row_of = vectors, {}
+        self._know(vectors)
         return added
+
+    def _know(self, vectors: WordVectors) -> None:
+        """Takes these vectors for all but the classes that have one already."""
+        gained = vectors.described([name for name in self._names if name not in self._described])
+        known = self._described.keys() | gained.keys()
+        named = (name for name in self._names if name in known)
+        self.labels = Labels(named, vectors.index, self._synonyms)
+        self._vectors, self._gained = vectors, gained
+        self._row_of: dict[str, int] = {}  # by label
+
+    def _vector(self, row: int, norm: float | None) -> np.ndarray:
+        """The vector [D] of a row of the table of classes; zeros if its class has none."""
+        name = self._row_names[row]
+        if row >= len(self._names):
+            return self._vectors.embed(name, norm)
+        if name in self._described:
+            return self._own.embed(self._described[name], norm)
+        if name in self._gained:
+            return self._vectors.embed(self._gained[name], norm)
+        return np.zeros(self._vectors.vectors.shape[1], np.float32)
 
     def _index(self, label: str) -> int:
         """The row in the table of classes of what a label means; new words get a new row."""
         if label not in self._row_of:
             key = class_words(self.labels.resolve(label))
-            self._row_of[label] = self._rows.setdefault(key, len(self._rows))
+            if key not in self._rows:
+                self._rows[key] = len(self._row_names)
+                self._row_names.append(" ".join(key))
+            self._row_of[label] = self._rows[key]
         return self._row_of[label]
 
     def _shown(self, detections: Sequence[Detection]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

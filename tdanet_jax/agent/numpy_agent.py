@@ -109,8 +109,10 @@ class NumPyAgent(BaseAgent):
         vectors: WordVectors,
         grid: PoseGrid = ITHOR,
         synonyms: Synonyms | Path | str | None = None,
+        more_words: Mapping[str, Sequence[float]] | Path | str | None = None,
     ) -> None:
-        super().__init__(meta.classes, vectors, dataclasses.replace(meta.spec, grid=grid), synonyms)
+        spec = dataclasses.replace(meta.spec, grid=grid)
+        super().__init__(meta.classes, vectors, spec, synonyms, more_words)
         self.meta = meta
         self.weights = weights
         self._embedded: dict[int, np.ndarray] = {}  # row of a name -> its vector
@@ -187,8 +189,7 @@ class NumPyAgent(BaseAgent):
     def _word(self, row: int) -> np.ndarray:
         """The vector [D] of the name in a row of the table of classes."""
         if row not in self._embedded:
-            name = " ".join([*self._rows][row])
-            (self._embedded[row],) = self._vectors.table([name], self.meta.word_norm)
+            self._embedded[row] = self._vector(row, self.meta.word_norm)
         return self._embedded[row]
 
     def _target(self, row: int) -> Target:
@@ -281,8 +282,6 @@ def load(
         raise ValueError(f"--reach-threshold: {folder} was trained without it")
     meta = dataclasses.replace(meta, **decisions.replaced)
     vectors = words.load_word_vectors(folder / WORDS_FILE)
-    if more_words is not None:
-        vectors = vectors.extended(more_words)
     weights = npz.read(folder / MODEL_FILE)
     expected = shapes(meta, vectors.vectors.shape[1])
     for name in sorted({*weights, *expected}):
@@ -292,7 +291,7 @@ def load(
             raise FileError(folder / MODEL_FILE, f"{name} is {shape}, not {wanted}")
     if isinstance(synonyms, str | Path):
         synonyms = _read_json(Path(synonyms))
-    return NumPyAgent(meta, weights, vectors, grid, synonyms)
+    return NumPyAgent(meta, weights, vectors, grid, synonyms, more_words)
 
 
 def shapes(meta: Meta, word: int) -> dict[str, tuple[int, ...]]:

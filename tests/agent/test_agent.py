@@ -227,6 +227,39 @@ def test_a_class_without_a_word_vector_is_unknown_until_it_is_given_one(weights,
     np.testing.assert_allclose(one.probabilities, other.probabilities, rtol=1e-4)
 
 
+@pytest.mark.parametrize(
+    "names", [("Mug", "mug", "Bowl", "Bed"), ("\u732b", "\u72ac", "Bowl", "Bed")]
+)
+def test_classes_of_equal_words_leave_the_others_their_vectors(weights, glove, names):
+    agent = Agent(CONFIG, weights, glove, ClassVocabulary(names, (0, 1, 2, 3)))
+    plain = Agent(CONFIG, weights, glove)
+    seen = [Detection(name, 0.1, 0.1, 0.3, 0.4) for name in ("bed", "bowl", "mug", "sink")]
+    for target in ("bowl", "bed", "mug", "toaster"):
+        one, other = (a.act(a.start(), seen, target)[1] for a in (agent, plain))
+        np.testing.assert_allclose(one.probabilities, other.probabilities, rtol=1e-4)
+        np.testing.assert_allclose(one.attention, other.attention, rtol=1e-4)
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_further_words_leave_the_classes_their_vectors(weights, glove, at_once):
+    """Trained with the vector of "lamp stand", and with the mean of "coffee" and "machine"."""
+    assert "lampstand" not in glove.index
+    more = dict.fromkeys(("lampstand", "coffee machine", "zzqx"), -glove.embed("sink", None))
+    classes = ClassVocabulary(("Lampstand", "CoffeeMachine", "zzqx"), (0, 1, 2))
+    agent, plain = (
+        Agent(CONFIG, weights, glove, classes, more_words=words)
+        for words in (more if at_once else None, None)
+    )
+    if not at_once:
+        assert agent.add_words(more) == 3
+    seen = [Detection(name, 0.1, 0.1, 0.3, 0.4) for name in ("lampstand", "coffee machine", "mug")]
+    for target in ("lampstand", "CoffeeMachine"):
+        one, other = (a.act(a.start(), seen, target)[1] for a in (agent, plain))
+        np.testing.assert_allclose(one.probabilities, other.probabilities, rtol=1e-5)
+    assert agent.knows("zzqx")
+    assert not plain.knows("zzqx")
+
+
 def test_of_another_target_an_agent_has_never_seen_anything(triangulating_agent):
     mug, sink = Detection("mug", 0.1, 0.1, 0.3, 0.4), Detection("sink", 0.6, 0.1, 0.8, 0.4)
     state, _ = triangulating_agent.act(triangulating_agent.start(), [mug, sink], "mug")
