@@ -137,22 +137,24 @@ def published_parents(
     Args:
       tables: their classes are the vocabulary; parents of other names are left out.
       targets: room type -> target classes; a target without a room type gets no parents.
-      published: room type -> target -> parent -> R_p; the three largest stay.
+      published: room type -> target -> parent -> R_p; the three largest stay. Of a target of
+        several room types, a parent has the larger value.
       hidden: classes that training must not know, as parents neither.
     """
     classes = np.full((len(tables.targets), PARENTS_PER_TARGET), -1, np.int32)
     reward = np.zeros((len(tables.targets), PARENTS_PER_TARGET), np.float32)
+    merged: dict[str, dict[str, float]] = {}
     for room, names in targets.items():
         for target in names:
-            known = {
-                name: share
-                for name, share in published.get(room, {}).get(target, {}).items()
-                if name in tables.classes and name not in hidden
-            }
-            best = sorted(known.items(), key=lambda item: (-item[1], item[0]))
-            for slot, (name, share) in enumerate(best[:PARENTS_PER_TARGET]):
-                classes[tables.targets.index(target), slot] = tables.classes.index(name)
-                reward[tables.targets.index(target), slot] = share
+            known = merged.setdefault(target, {})
+            for name, share in published.get(room, {}).get(target, {}).items():
+                if name in tables.classes and name not in hidden:
+                    known[name] = max(share, known.get(name, share))
+    for target, known in merged.items():
+        best = sorted(known.items(), key=lambda item: (-item[1], item[0]))
+        for slot, (name, share) in enumerate(best[:PARENTS_PER_TARGET]):
+            classes[tables.targets.index(target), slot] = tables.classes.index(name)
+            reward[tables.targets.index(target), slot] = share
     return Parents(classes, reward)
 
 

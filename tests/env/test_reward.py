@@ -132,6 +132,23 @@ def test_a_target_of_two_room_types_has_its_parents_from_both() -> None:
         assert dict(parents_by_name(tables, find_parents(tables, targets), "Mug")) == worth
 
 
+def test_published_parents_of_two_room_types_are_the_three_largest_of_both() -> None:
+    tables = tables_of([furnished("kitchen", Mug=0.0)], CLASSES, ["Apple", "Mug"])
+    published = {
+        "kitchen": {"Mug": {"Sink": 0.4, "Shelf": 0.3, "Desk": 0.2}},
+        "bedroom": {"Mug": {"Desk": 0.1, "Drawer": 0.25, "Lamp": 0.5, "Fridge": 0.5}},
+    }
+    targets = {"kitchen": ["Mug"], "bedroom": ["Mug"]}
+    for rooms in (targets, dict(reversed(targets.items()))):
+        found = reward.published_parents(tables, rooms, published, {"Fridge"})
+        expected = [("Sink", 0.4), ("Shelf", 0.3), ("Drawer", 0.25)]
+        assert parents_by_name(tables, found, "Mug") == [(n, pytest.approx(r)) for n, r in expected]
+        assert parents_by_name(tables, found, "Apple") == []
+    del published["bedroom"]["Mug"]["Drawer"]
+    found = reward.published_parents(tables, targets, published, {"Fridge"})
+    assert parents_by_name(tables, found, "Mug")[2] == ("Desk", pytest.approx(0.2))
+
+
 def test_a_target_that_is_not_asked_for_has_no_parents() -> None:
     tables = tables_of([furnished("kitchen", Mug=0.0, Apple=0.5, Sink=1.0)], CLASSES, ["Apple"])
     found = find_parents(tables, {"kitchen": []})
