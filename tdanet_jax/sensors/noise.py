@@ -225,7 +225,7 @@ def detect(
     is_false = place(jnp.zeros_like(there), jnp.zeros_like(false), jnp.ones_like(false))
     labels = _labels(classes, own, levels, params, is_false)
     scores = _scores(~is_false & (labels == classes), boxes, own, levels)
-    boxes, visible = _boxes(boxes, corners, own, levels)
+    boxes, visible = _boxes(boxes, corners, own, levels, params.one_per_class)
     mask &= visible
     if seen.boxes.shape[1] > 3:
         boxes = jnp.concatenate([boxes, scores], axis=1)
@@ -261,7 +261,7 @@ def _scores(right: jax.Array, boxes: jax.Array, bits: jax.Array, levels: NoiseLe
 
 
 def _boxes(
-    boxes: jax.Array, corners: jax.Array, bits: jax.Array, levels: NoiseLevels
+    boxes: jax.Array, corners: jax.Array, bits: jax.Array, levels: NoiseLevels, one_per_class: bool
 ) -> tuple[jax.Array, jax.Array]:
     """Boxes x, y, S after jitter and truncation, and whether anything of them is left.
 
@@ -275,6 +275,8 @@ def _boxes(
     low = jnp.clip(lower + (moved - grown), least, most)
     high = jnp.clip(upper + (moved + grown), least, most)
     middle = boxes[:, :2] + ((low - lower) + (high - upper)) / 2
+    if one_per_class:  # the mean of the instances' centres may lie near the end that is cut off
+        middle = jnp.clip(middle, low, high)
     whole = jnp.prod(side, axis=1)
     ratio = jnp.where(whole > 0, jnp.prod(high - low, axis=1) / jnp.maximum(whole, 1e-12), 1.0)
     area = jnp.minimum(boxes[:, 2] * ratio, 1.0)

@@ -83,9 +83,13 @@ def episode(levels: dict[str, float]) -> EpisodeNoise:
     return EpisodeNoise(jax.random.key_data(jax.random.key(0)), values)
 
 
-@jax.jit
-def detect(seen: Detections, corners: jax.Array, bits: jax.Array, own: EpisodeNoise) -> Detections:
-    return noise.detect(seen, corners, bits, own, PARAMS, ROW_CLASS)
+@functools.partial(jax.jit, static_argnums=4)
+def detect(
+    seen: Detections, corners: jax.Array, bits: jax.Array, own: EpisodeNoise,
+    one_per_class: bool = False,
+) -> Detections:  # fmt: skip
+    params = PARAMS.replace(one_per_class=one_per_class)
+    return noise.detect(seen, corners, bits, own, params, ROW_CLASS)
 
 
 def random_levels(rng: np.random.Generator) -> dict[str, float]:
@@ -95,17 +99,19 @@ def random_levels(rng: np.random.Generator) -> dict[str, float]:
     return {n: int(rng.integers(17)) / 16 * most.get(n, 1) * (rng.random() < 0.5) for n in NAMES}
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(0, K))
-def test_frames_are_those_of_the_definition(seed: int, count: int) -> None:
+@given(st.integers(0, 2**32 - 1), st.integers(0, K), st.booleans())
+def test_frames_are_those_of_the_definition(seed: int, count: int, one_per_class: bool) -> None:
     rng = np.random.default_rng(seed)
     seen = [TABLE[i] for i in rng.choice(ROWS, count, replace=False)]
     levels = random_levels(rng)
     bits = rng.integers(0, 65536, (8, K + EXTRA + 1))
-    found = detect(*frame_of(seen), jnp.asarray(bits, jnp.uint16), episode(levels))
+    drawn = jnp.asarray(bits, jnp.uint16)
+    found = detect(*frame_of(seen), drawn, episode(levels), one_per_class)
     known = np.asarray(PARAMS.known)[: int(PARAMS.known_count)].tolist()
     expected = noise_oracle.detect(
-        seen, K, TABLE, bits.tolist(), levels, known, np.asarray(PARAMS.similar).tolist()
-    )
+        seen, K, TABLE, bits.tolist(), levels, known, np.asarray(PARAMS.similar).tolist(),
+        one_per_class,
+    )  # fmt: skip
     mask = np.asarray(found.mask)
     assert mask.tolist() == [row is not None for row in expected]
     for i, row in enumerate(expected):
@@ -210,6 +216,17 @@ def test_jitter_is_a_share_of_the_sides() -> None:
     assert boxes[:, 0].std() == pytest.approx(0.1 * 0.2, rel=0.05)
     assert boxes[:, 1].std() == pytest.approx(0.1 * 0.1, rel=0.05)
     assert np.log(boxes[:, 2] / 0.02).std() == pytest.approx(0.1 * math.sqrt(2), rel=0.05)
+
+
+def test_the_mean_centre_of_a_class_stays_in_its_box() -> None:
+    one = Seen(0, (0.9, 0.1, 0.2), (0.6, 0.0, 1.0, 0.5))  # most instances near one corner
+    seen, corners = frame_of([one])
+    own = episode({**dict.fromkeys(NAMES, 0.0), "jitter": 0.5})
+    bits = jax.random.bits(jax.random.key(1), (300, 8, K + EXTRA + 1), jnp.uint16)
+    found = jax.vmap(detect, (None, None, 0, None, None))(seen, corners, bits, own, True)
+    middle = np.asarray(found.boxes[:, 0, :2])[np.asarray(found.mask[:, 0])]
+    assert ((middle >= 0) & (middle <= 1)).all()
+    assert (middle == [1, 0]).any(axis=0).all()
 
 
 def test_what_lies_in_the_border_is_missed_and_what_reaches_into_it_is_cut() -> None:

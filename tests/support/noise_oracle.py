@@ -41,6 +41,7 @@ def normal(bits: int) -> float:
 def detect(
     seen: Sequence[Seen], longest: int, everything: Sequence[Seen], bits: Bits,
     level: Mapping[str, float], known: Sequence[int], similar: Sequence[Sequence[int]],
+    one_per_class: bool = False,
 ) -> list[Detected | None]:  # fmt: skip
     """The rows of a frame: what is there, then up to four false ones and duplicates.
 
@@ -52,6 +53,8 @@ def detect(
       level: levels of noise by name.
       known: classes that are detected anywhere, ascending.
       similar: what each class is confused with.
+      one_per_class: whether a centre is a mean over instances, and the first row of each class
+        alone stays.
     """
     miss, change, pick, dx, dy, dw, dh, sure = bits
     rows: list[Detected | None] = [None] * longest
@@ -86,6 +89,8 @@ def detect(
         drawn *= 1 - math.exp(-math.sqrt(one.box[2]) / 0.1) / 2
         score = 1 - level["scores"] * (1 - drawn)
         x, y, area = one.box[0] + shift[0], one.box[1] + shift[1], one.box[2] * ratio
+        if one_per_class:
+            x, y = (min(max(at, e[2]), e[3]) for at, e in zip((x, y), edges, strict=True))
         return Detected(cls, x, y, min(area, 1.0), score)
 
     for i, one in enumerate(seen):
@@ -103,6 +108,10 @@ def detect(
             copied = copy * len(seen) // 65536
             if shown[copied]:
                 rows[i] = perceived(seen[copied], i, is_false=False)
+    if one_per_class:
+        for i, row in enumerate(rows):
+            if row and row.cls in [earlier.cls for earlier in rows[:i] if earlier]:
+                rows[i] = None
     return rows
 
 
