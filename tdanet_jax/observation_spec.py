@@ -11,6 +11,8 @@ from typing import Literal
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.registry import SENSORS
 
+#: What a detection is of.
+Rows = Literal["object", "class"]
 #: Sensors that track the target by its boxes.
 TRACKING = ("triangulation", "robust-triangulation")
 
@@ -28,7 +30,7 @@ class ObservationSpec:
       scores: whether each box has the detector's confidence in addition, a share.
     """
 
-    rows: Literal["object", "class"] = "object"
+    rows: Rows = "object"
     image: Literal["raster", "features"] | None = None
     sensors: tuple[str, ...] = ()
     grid: PoseGrid = ITHOR

@@ -40,7 +40,7 @@ DPI = 110
 
 def formats() -> list[str]:
     """Endings of the files that pictures can be written to."""
-    return sorted(FigureCanvasBase.get_supported_filetypes())
+    return sorted({*FigureCanvasBase.get_supported_filetypes()} - {"pgf"})  # it needs LaTeX
 
 
 def save(figure: Figure, path: Path, dpi: int = DPI, comment: str | None = None) -> None:

@@ -28,9 +28,9 @@ MODULES = (
     "agent/__init__", "agent/base", "agent/camera", "agent/detection", "agent/detectors",
     "agent/navigator", "agent/numpy_agent", "decisions", "io/__init__", "io/archive", "io/assets",
     "io/escaping", "io/files", "io/untrusted/__init__", "io/untrusted/budgets",
-    "io/untrusted/hdf5", "io/untrusted/npz", "io/untrusted/regular", "labels", "observation_spec",
-    "poses", "registry", "sensors/__init__", "sensors/detections", "sensors/numpy_sensors",
-    "sensors/shared", "settings", "vocabulary", "words",
+    "io/untrusted/hdf5", "io/untrusted/jsons", "io/untrusted/npz", "io/untrusted/regular",
+    "labels", "observation_spec", "poses", "registry", "sensors/__init__", "sensors/detections",
+    "sensors/numpy_sensors", "sensors/shared", "settings", "vocabulary", "words",
 )  # fmt: skip
 #: The package's name in the exported folder, too.
 PACKAGE = "tdanet_jax"

@@ -21,6 +21,7 @@ from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import NetworkConfig, TrainConfig
 from tdanet_jax.decisions import Decisions
 from tdanet_jax.evaluation import episodes
+from tdanet_jax.labels import Labels
 from tdanet_jax.models.classes import ClassVocabulary
 from tdanet_jax.models.factory import make_model
 from tdanet_jax.scenes import camera_view
@@ -147,10 +148,9 @@ def test_a_folder_of_an_older_version_decides_as_it_did(folder, tmp_path):
     assert agent.meta == numpy_agent.load(folder).meta
     seen = [Detection("mug", 0.1, 0.1, 0.3, 0.4)]
     assert agent.act(agent.start(), seen, "mug")[1].reach is None
-    for value in (0.0, float("nan")):
-        (older / "meta.json").write_text(json.dumps(meta | {"temperature": value}))
-        with pytest.raises(ValueError, match=r"meta\.json: --temperature .*: must be"):
-            numpy_agent.load(older)
+    (older / "meta.json").write_text(json.dumps(meta | {"temperature": 0.0}))
+    with pytest.raises(ValueError, match=r"meta\.json: --temperature .*: must be"):
+        numpy_agent.load(older)
 
 
 def test_a_navigator_runs_it(folder):
@@ -188,9 +188,24 @@ def test_a_navigator_runs_it(folder):
             ),
             "reach_units: needs triangulation",
         ),
+        *(
+            ("meta.json", lambda text, field=field: json.dumps(json.loads(text) | field), message)
+            for field, message in [
+                ({"rows": "objects"}, r"meta\.json: rows objects: must be object or class"),
+                ({"rows": "class"}, r"meta\.json: --triangulation: needs a box of every object"),
+                ({"sensors": ["triangulation"]}, r"meta\.json: --triangulation: needs --odometry"),
+                ({"sensors": ["odometry"] * 2}, r"meta\.json: sensors: one is listed twice"),
+                ({"target_box": [0.5, 0.5]}, r"meta\.json: target_box is not 3 numbers"),
+                ({"target_box": [0.5, 0.5, "x"]}, r"meta\.json: .*target_box, is not a number"),
+                ({"word_norm": 0.0}, r"meta\.json: word_norm is not positive"),
+                ({"word_norm": 1e300}, r"meta\.json: word_norm, .* is not finite or above"),
+                ({"temperature": float("nan")}, r"meta\.json: not JSON \(NaN is not a number"),
+            ]
+        ),
+        ("meta.json", lambda text: "[" * 100_000, r"meta\.json: lists and objects \d+ deep"),
         ("model.npz", None, r"model\.npz: no such file"),
         ("words.npz", None, r"words\.npz: no such file"),
-        ("meta.json", None, r"meta\.json: No such file"),
+        ("meta.json", None, r"meta\.json: no such file"),
     ],
 )
 def test_a_broken_folder_is_refused_in_one_line(folder, tmp_path, name, change, message):
@@ -202,6 +217,35 @@ def test_a_broken_folder_is_refused_in_one_line(folder, tmp_path, name, change, 
     with pytest.raises(ValueError, match=message) as refused:
         numpy_agent.load(broken)
     assert "\n" not in str(refused.value)
+
+
+def test_parameters_must_be_finite(folder, tmp_path):
+    broken = shutil.copytree(folder, tmp_path / "broken")
+    arrays = dict(np.load(broken / "model.npz"))
+    arrays["critic/bias"][:] = np.inf
+    np.savez(broken / "model.npz", **arrays)
+    with pytest.raises(ValueError, match=r"model\.npz: critic/bias is not finite$"):
+        numpy_agent.load(broken)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"Mug": ["a"], "Mug": ["b"]}', r"mine\.json: Mug: is listed twice"),
+        ('{"Mug": "Humpen"}', r"mine\.json: Mug: not a list of names"),
+        ('{"qwertzu": ["a"]}', r"mine\.json: label 'qwertzu': no word vector"),
+        ("[" * 100_000, r"mine\.json: lists and objects \d+ deep"),
+    ],
+)
+def test_a_table_of_synonyms_is_read_as_in_jax(folder, glove, tmp_path, text, message):
+    (tmp_path / "mine.json").write_text(text)
+    for read in (
+        lambda path: numpy_agent.load(folder, synonyms=path),
+        lambda path: Labels((), glove.index, path),
+    ):
+        with pytest.raises(ValueError, match=message) as refused:
+            read(tmp_path / "mine.json")
+        assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(

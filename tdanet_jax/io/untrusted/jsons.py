@@ -14,9 +14,10 @@ from tdanet_jax.io.untrusted import FileError, regular
 from tdanet_jax.io.untrusted.budgets import excess
 
 _SPACE = " \t\n\r"
-#: Strings, whether or not they end; what is left of a document without them shows its nesting.
-_STRINGS = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
-_NOT_BRACKETS = re.compile(r"[^\[\]{}]++")
+#: Escapes; then strings, whether or not they end. What is left of a document without them shows
+#: its nesting, up to the first backslash outside of a string, where decoding ends.
+_ESCAPES, _STRINGS = re.compile(r"\\.", re.DOTALL), re.compile(r'"[^"]*"?')
+_NOT_BRACKETS = re.compile(r"[^\[\]{}]+")
 
 
 def load(path: Path, links: bool = True, nan: bool = False) -> Any:
@@ -56,7 +57,7 @@ def parse(path: Path | str, text: str, nan: bool = False) -> Any:
 
 def _check_nesting(path: Path | str, text: str, counted: bool = True) -> None:
     """Raises FileError if a JSON text holds too many lists and objects, or too deep ones."""
-    brackets = _NOT_BRACKETS.sub("", _STRINGS.sub("", text)).encode()
+    brackets = _NOT_BRACKETS.sub("", _STRINGS.sub("", _ESCAPES.sub("", text))).encode()
     if not brackets:
         return
     steps = np.frombuffer(brackets, np.uint8) & 2  # of the four, opening ones alone have this bit
