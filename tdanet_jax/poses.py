@@ -9,6 +9,7 @@ state.
 from __future__ import annotations
 
 import dataclasses
+import math
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -75,6 +76,7 @@ class PoseGrid:
             raise ValueError(
                 f"horizons {list(looks)}: must be whole degrees from -90 to 90, ascending, with 0"
             )
+        object.__setattr__(self, "horizons", tuple(looks))  # a list would have no hash
 
     @property
     def turn(self) -> int:
@@ -132,11 +134,11 @@ class PoseGrid:
         Raises:
           ValueError: there is none within a tenth of a degree.
         """
-        turns = round(rotation / self.turn)
-        if abs(rotation - self.turn * turns) > TOLERANCE:
+        turns = round(rotation / self.turn) if math.isfinite(rotation) else 0
+        if not abs(rotation - self.turn * turns) <= TOLERANCE:  # so that NaN is refused, too
             raise ValueError(f"rotation {rotation}: not a multiple of {self.turn} degrees")
         look = min(self.horizons, key=lambda degrees: abs(degrees - horizon))
-        if not abs(horizon - look) <= TOLERANCE:  # so that NaN is refused, too
+        if not abs(horizon - look) <= TOLERANCE:
             known = ", ".join(map(str, self.horizons))
             raise ValueError(f"horizon {horizon}: not among {known} degrees")
         return turns % self.rotations, self.horizons.index(look)

@@ -74,6 +74,19 @@ def test_steps_go_to_the_neighbour_in_the_nearest_direction() -> None:
         assert grid.neighbour(jnp.arange(grid.rotations)).tolist() == cosine.argmax(axis=1).tolist()
 
 
+def test_a_list_of_horizons_makes_the_same_grid() -> None:
+    grid = PoseGrid(horizons=[0, 30])  # type: ignore[arg-type]
+    assert {grid} == {poses.ITHOR}
+
+
+@pytest.mark.parametrize("degrees", [float("nan"), float("inf"), -float("inf")])
+def test_a_view_that_is_no_number_is_refused_by_name(degrees: float) -> None:
+    with pytest.raises(ValueError, match=f"^rotation {degrees}: not a multiple of 45 degrees$"):
+        poses.ITHOR.nearest_view(degrees, 0)
+    with pytest.raises(ValueError, match=f"^horizon {degrees}: not among 0, 30 degrees$"):
+        poses.ITHOR.nearest_view(0, degrees)
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
