@@ -200,6 +200,11 @@ class BaseAgent:
         """
         if self.spec.sensors and blocked is None and action == Action.MOVE_AHEAD:
             raise ValueError("the agent has sensors: say whether its MoveAhead was `blocked`")
+        for one in forbidden:
+            if not isinstance(one, int | np.integer) or not 0 <= one < NUM_ACTIONS:
+                raise ValueError(f"forbidden {one!r}: must be an Action, 0 to {NUM_ACTIONS - 1}")
+        if not isinstance(pose, MeasuredPose | None):
+            raise ValueError("pose: must be what `measured_pose` gives")
         if len({*forbidden}) >= NUM_ACTIONS:
             raise ValueError("every action is forbidden")
         if "odometry" in self.spec.sensors and measured != (pose is not None):

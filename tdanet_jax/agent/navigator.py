@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from tdanet_jax.agent import detectors
 from tdanet_jax.agent.camera import Camera, turned
 from tdanet_jax.agent.detection import Detection
+from tdanet_jax.io.escaping import in_line
 from tdanet_jax.labels import LabelError
 from tdanet_jax.sensors.shared import measured_pose
 from tdanet_jax.vocabulary import ACTION_NAMES, FIELD_OF_VIEW, Action
@@ -204,8 +205,12 @@ class Navigator:
 
     def _measure(self, pose: RobotPose) -> MeasuredPose:
         """A robot's pose in the axes of the agent's odometry."""
-        if len(pose) != 3 or not all(map(math.isfinite, pose)):
-            raise ValueError(f"pose {pose}: must be x, y and yaw, three finite numbers")
+        try:
+            known = len(pose) == 3 and all(map(math.isfinite, pose))
+        except TypeError:
+            known = False
+        if not known:
+            raise ValueError(f"pose {in_line(pose)}: must be x, y and yaw, three finite numbers")
         x, y, yaw = pose if self._origin is None else self._origin
         ahead = (pose[0] - x) * math.cos(yaw) + (pose[1] - y) * math.sin(yaw)
         left = (pose[1] - y) * math.cos(yaw) - (pose[0] - x) * math.sin(yaw)

@@ -510,6 +510,18 @@ def test_what_is_forbidden_is_never_done(agent):
         agent.act(agent.start(), seen, "mug", forbidden=Action)
 
 
+@pytest.mark.parametrize("forbidden", [["LookUp"], [7], [-1], [[0]]])
+def test_what_is_no_action_cannot_be_forbidden(agent, forbidden):
+    with pytest.raises(ValueError, match=r"^forbidden .*: must be an Action, 0 to 5$"):
+        agent.act(agent.start(), [], "mug", forbidden=forbidden)
+
+
+@pytest.mark.parametrize("pose", [5.0, (0, 0, 0)])
+def test_a_pose_must_be_measured(odometry_agent, pose):
+    with pytest.raises(ValueError, match=r"^pose: must be what `measured_pose` gives$"):
+        odometry_agent.act(odometry_agent.start(measured=True), [], "mug", pose=pose)
+
+
 def several(agent, steps, together):
     """What three robots decide in some steps, by `act_many` or one after the other."""
     boxes = [Detection(name, 0.1, 0.1, 0.3, 0.4) for name in ("sink", "mug", "plate")]

@@ -237,13 +237,17 @@ def test_measured_turns_move_what_is_kept(navigator):
         (None, (0, 0, 0), "pose: give one in every step of an episode, or in none"),
         ((0, 0, 0), (0, float("nan"), 0), "must be x, y and yaw, three finite numbers"),
         ((0, 0, 0), (0, 0), "must be x, y and yaw, three finite numbers"),
+        ((0, 0, 0), 5.0, "pose 5.0: must be x, y and yaw, three finite numbers"),
+        ((0, 0, 0), ("a", 0, 0), "must be x, y and yaw, three finite numbers"),
+        ((0, 0, 0), np.zeros((3, 3)), "must be x, y and yaw, three finite numbers"),
     ],
 )
 def test_a_bad_pose_changes_nothing(navigator, first, second, message):
     nav = navigator("LookUp", "LookUp")
     nav.step([MUG], pose=first)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message) as refused:
         nav.step([], pose=second)
+    assert "\n" not in str(refused.value)
     assert (nav.steps, len(nav.agent.calls)) == (1, 1)
     assert nav.step([], pose=first) == "LookUp"
 
