@@ -105,7 +105,8 @@ class NavigationEnv(gymnasium.Env):
       config: what else can be set, as `tdanet_jax.make` takes it.
 
     Raises:
-      ValueError: no environment has this name; by `step`: no action has this number.
+      ValueError: no environment has this name; by `step`: no action has this number, or there is
+        not one for each episode.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own form)
@@ -140,8 +141,8 @@ class NavigationEnv(gymnasium.Env):
         """One action; `info` holds the target's name, `success`, `length` and `shortest`."""
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        _check(action)
-        obs, out = self._shown.step(self._state, jnp.int32(action), self._shown.params)
+        taken = _checked(action, ())
+        obs, out = self._shown.step(self._state, taken, self._shown.params)
         out = jax.device_get(out)
         self._state = out.state
         info = self._about(out.state) | {"success": bool(out.success)}
@@ -212,9 +213,7 @@ class NavigationVectorEnv(VectorEnv):
         """One action [num_envs] in each episode."""
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        for action in np.asarray(actions).tolist():
-            _check(action)
-        taken = jnp.asarray(actions, jnp.int32)
+        taken = _checked(actions, (self.num_envs,))
         step = self._shown.step_many
         self._state, told = step(self._keys(), self._state, taken, self._shown.params)
         obs, (reward, terminated, truncated), final, about = _on_host(told)
@@ -238,9 +237,15 @@ def _on_host(arrays: Any) -> Any:
     return jax.tree.map(np.array, arrays)
 
 
-def _check(action: int) -> None:
-    if not 0 <= action < NUM_ACTIONS:
-        raise ValueError(f"action {action}: must be from 0 to {NUM_ACTIONS - 1}")
+def _checked(actions: Any, shape: tuple[int, ...]) -> jax.Array:
+    """The actions in JAX, if there are as many as there should be and each of them exists."""
+    given = np.asarray(actions)
+    if given.shape != shape:
+        raise ValueError(f"actions of shape {given.shape}: must have shape {shape}")
+    for action in given.ravel().tolist():
+        if action not in range(NUM_ACTIONS):  # a fraction is not
+            raise ValueError(f"action {action}: must be a whole number from 0 to {NUM_ACTIONS - 1}")
+    return jnp.asarray(given, jnp.int32)
 
 
 for _split in UNSEEN:

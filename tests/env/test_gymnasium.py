@@ -145,12 +145,22 @@ def test_spaces_hold_what_is_observed(config: TrainConfig) -> None:
     assert actions.sample(jax.random.key(2)) in range(6)
 
 
-@pytest.mark.parametrize("action", [-1, 6])
+@pytest.mark.parametrize("action", [-1, 6, 1.5])
 def test_actions_out_of_range_are_refused(config: TrainConfig, action: Any) -> None:
     one, many = NavigationEnv(config=config), NavigationVectorEnv(2, config=config)
     for env, given in ((one, action), (many, np.array([0, action]))):
         with pytest.raises(gymnasium.error.ResetNeeded):
             env.step(given)
         env.reset(seed=0)
-        with pytest.raises(ValueError, match=f"^action {action}: must be from 0 to 5$"):
+        with pytest.raises(ValueError, match=f"^action {action}: must be a whole number from 0 to"):
             env.step(given)
+
+
+def test_there_must_be_one_action_for_each_episode(config: TrainConfig) -> None:
+    one, many = NavigationEnv(config=config), NavigationVectorEnv(2, config=config)
+    one.reset(seed=0)
+    many.reset(seed=0)
+    for env, given in ((one, [1]), (many, [1]), (many, [[1], [1]]), (many, 1)):
+        with pytest.raises(ValueError, match=r"^actions of shape \(.*\): must have shape \(.*\)$"):
+            env.step(given)  # type: ignore[arg-type]
+    assert many.step(np.array([1.0, 2.0]))[1].shape == (2,)
