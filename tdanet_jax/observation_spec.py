@@ -62,13 +62,19 @@ class ObservationSpec:
                 raise ValueError(
                     f"--sensors {name}: choose among {', '.join(SENSORS)}, or name a module"
                 )
-        tracking = [i for i, name in enumerate(self.sensors) if name in TRACKING]
-        if tracking and "odometry" not in self.sensors[: tracking[0]]:
-            raise ValueError("--triangulation: needs --odometry (or use --no-triangulation)")
-        for flag in ["triangulation"] * bool(tracking) + ["scores"] * self.scores:
+        tracker = self.tracker
+        if {*TRACKING} <= {*self.sensors}:
+            raise ValueError(f"--{tracker}: not with {', '.join({*TRACKING} - {tracker})}, too")
+        # The robust one may have been asked for by --sensors, which has no --no-...
+        instead = {name: f"use --no-{name}" for name in ("triangulation", "scores")}
+        if tracker and "odometry" not in self.sensors[: self.sensors.index(tracker)]:
+            raise ValueError(
+                f"--{tracker}: needs --odometry (or {instead.get(tracker, 'leave it out')})"
+            )
+        for flag in filter(None, (tracker, "scores" * self.scores)):
             if self.rows != "object" or self.image is not None:
                 what = model or (f"--image {self.image}" if self.image else f"--rows {self.rows}")
                 raise ValueError(
                     f"--{flag}: needs a box of every object, which {what} does not show; "
-                    f"use --no-{flag}"
+                    f"{instead.get(flag, 'leave it out')}"
                 )

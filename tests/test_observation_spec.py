@@ -35,6 +35,19 @@ BOTH = ("odometry", "triangulation")
             "--triangulation: needs --odometry (or use --no-triangulation)",
         ),
         (
+            ObservationSpec(sensors=("robust-triangulation",)),
+            "--robust-triangulation: needs --odometry (or leave it out)",
+        ),
+        (
+            ObservationSpec(sensors=(*BOTH, "robust-triangulation")),
+            "--triangulation: not with robust-triangulation, too",
+        ),
+        (
+            ObservationSpec(rows="class", sensors=("odometry", "robust-triangulation")),
+            "--robust-triangulation: needs a box of every object, which --rows class does not "
+            "show; leave it out",
+        ),
+        (
             ObservationSpec(rows="class", sensors=BOTH),
             "--triangulation: needs a box of every object, which --rows class does not show; "
             "use --no-triangulation",
