@@ -173,7 +173,8 @@ def read_coco(
         there[number] = []
         if isinstance(one.get("file_name"), str):
             stem = _number_of(Path(one["file_name"]).stem)
-            twice |= {stem} & {*by_file}
+            if stem in by_file:
+                twice.add(stem)
             by_file[stem] = number
         if min(sizes[number]) <= 0:
             raise FileError(truth, f"{at}: width and height must be positive")
