@@ -66,11 +66,17 @@ class Command:
     @property
     def camera(self) -> Camera:
         """The robot's camera. Raises ValueError if a value is out of range."""
-        if self.hfov is not None:
-            return Camera(self.hfov, self.vfov, self.aspect, horizon=self.horizon)
-        if self.vfov is not None or self.aspect is not None:
+        if self.hfov is None and (self.vfov is not None or self.aspect is not None):
             raise ValueError("--vfov and --aspect need --hfov")
-        return Camera(90, 90, horizon=self.horizon)
+        try:
+            if self.hfov is None:
+                return Camera(90, 90, horizon=self.horizon)
+            return Camera(self.hfov, self.vfov, self.aspect, horizon=self.horizon)
+        except ValueError as error:
+            problem = str(error).removeprefix("camera: ")
+            if getattr(self, name := problem.split()[0], None) is None:  # it is no flag's value
+                problem = f"{'aspect' if name == 'vfov' else 'hfov'}: {problem}"
+            raise ValueError(f"--{problem}") from None
 
     @property
     def grid(self) -> PoseGrid:
@@ -82,7 +88,10 @@ class Command:
             )
         if self.turn not in TURNS:
             raise ValueError(f"--turn {self.turn:g}: choose one of {', '.join(map(str, TURNS))}")
-        return PoseGrid(self.grid_size, round(360 / self.turn), self.horizons)
+        try:
+            return PoseGrid(self.grid_size, round(360 / self.turn), self.horizons)
+        except ValueError as error:  # the others are possible
+            raise ValueError(f"--{error}") from None
 
 
 def main(arguments: list[str] | None = None) -> None:

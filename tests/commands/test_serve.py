@@ -8,9 +8,11 @@ import json
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from tdanet_jax.agent.navigator import NavigatorConfig
 from tdanet_jax.commands import serve
 from tests.agent.test_agent import OLD_RUN
 
@@ -40,6 +42,28 @@ def test_every_line_has_an_answer(
     assert replies[3]["finished"]
     assert replies[4]["error"] == "line 6: no episode has begun, or it is over: give a target"
     assert told.startswith("ready: sees 69 degrees across and 55 down")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"horizons": (30,)}, r"--horizons \[30\]: must be whole degrees"),
+        ({"turn": 50}, "--turn 50: choose one of"),
+        ({"grid_size": 5}, "--grid-size 5: must be from"),
+        ({"hfov": 200, "vfov": 50}, "--hfov 200: must be between 5 and 180"),
+        ({"hfov": 50, "vfov": 200}, "--vfov 200: must be between 5 and 180"),
+        ({"hfov": 50, "aspect": 0}, "--aspect 0: must be between 0 and 100"),
+        ({"hfov": 50, "aspect": 50}, "--aspect: vfov 1.0.*: must be between 5 and 180"),
+        ({"hfov": 50}, "--hfov: give either vfov, in degrees, or aspect"),
+        ({"horizon": 95.0}, "--horizon 95.0: must be between -90 and 90"),
+    ],
+)
+def test_a_camera_or_grid_that_cannot_be_is_refused_with_its_flag(
+    fields: dict[str, Any], message: str
+) -> None:
+    command = serve.Command("a", NavigatorConfig(), **fields)
+    with pytest.raises(ValueError, match=f"^{message}"):
+        _ = command.camera, command.grid
 
 
 def test_further_words_and_names(
