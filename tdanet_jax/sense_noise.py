@@ -53,8 +53,8 @@ class SenseNoise:
     side is the square root of the box's area as a share of the image. A box shows what is not
     hidden, so the rate rises with occlusion, too."""
     false_positives: Level = 0.0
-    """Mean number of detections per frame of what is not there: class and box of a detection in a
-    random view of a random room."""
+    """Mean number of detections per frame of what is not there: class and box of one drawn from all
+    detections of all views."""
     duplicates: Level = 0.0
     """Mean number of second detections for each detection, at most 4 per frame."""
     swaps: Level = 0.0

@@ -102,8 +102,7 @@ def _write_agent(agent: Agent, word_vectors: str | None, folder: Path) -> None:
     if word_vectors is None:
         shutil.copy(assets.path(words.ASSET), folder / WORDS_FILE)
     else:
-        names = agent.classes.names
-        words.load_word_vectors(word_vectors, names).save_copy(folder / WORDS_FILE, names)
+        agent._vectors.save_copy(folder / WORDS_FILE, agent.classes.names)
     files.write_text(folder / META_FILE, json.dumps(meta, indent=2) + "\n")
 
 
