@@ -27,6 +27,7 @@ from tdanet_jax.models.factory import make_model
 from tdanet_jax.scenes import camera_view
 from tdanet_jax.splits import make_split
 from tdanet_jax.vocabulary import Action
+from tdanet_jax.words import WordVectors
 from tdanet_jax.workflows import export
 from tests.support import samples
 from tests.support.pages import ROOT, block
@@ -217,6 +218,16 @@ def test_a_broken_folder_is_refused_in_one_line(folder, tmp_path, name, change, 
     with pytest.raises(ValueError, match=message) as refused:
         numpy_agent.load(broken)
     assert "\n" not in str(refused.value)
+
+
+def test_words_of_a_runs_own_file_are_those_that_the_agent_has(glove, tmp_path):
+    """They are not read again."""
+    (tmp_path / "out").mkdir()
+    agent = small_agent(WordVectors(glove.index, glove.vectors * 1.1))
+    export._write_agent(agent, "no longer there.txt", tmp_path / "out")
+    kept = numpy_agent.load(tmp_path / "out")
+    for row in range(3):
+        np.testing.assert_array_equal(kept._vector(row, 3.0), agent._vector(row, 3.0))
 
 
 def test_parameters_must_be_finite(folder, tmp_path):
