@@ -199,13 +199,6 @@ def test_images_may_be_named_by_their_files(tmp_path: Path, files: tuple[str, st
     assert measured_noise.read_coco(*written(tmp_path, truth, FOUND)) == expected
 
 
-def test_many_images_are_read_in_linear_time(tmp_path: Path) -> None:
-    size = {"width": 10, "height": 10}
-    images = [{"id": i, "file_name": f"{i}.jpg", **size} for i in range(20_000)]
-    truth = {**TRUTH, "images": images, "annotations": []}  # seconds more in quadratic time
-    assert len(measured_noise.read_coco(*written(tmp_path, truth, []))[0]) == 20_000
-
-
 def test_images_that_ids_and_files_name_differently_are_refused(tmp_path: Path) -> None:
     files = {7: "8.jpg", 8: "7.jpg"}
     images = [{**image, "file_name": files[image["id"]]} for image in TRUTH["images"]]
