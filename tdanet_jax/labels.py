@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 
 from tdanet_jax.io import assets
-from tdanet_jax.io.untrusted import FileError
+from tdanet_jax.io.untrusted import FileError, jsons
 from tdanet_jax.vocabulary import class_words
 
 ASSET = "labels.json"
@@ -225,8 +225,6 @@ def read(path: Path | str) -> Synonyms:
     Raises:
       FileError: the file is missing, or holds no table; the message names the entry.
     """
-    from tdanet_jax.io.untrusted import jsons  # needs Python 3.11, and a robot may have 3.10
-
     table: dict[str, Iterable[str]] = {}
     for name, others in jsons.members(Path(path)):
         if name in table:

@@ -10,10 +10,9 @@ It is used as an `agent.Agent`, by a `Navigator` too, and decides the same.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -21,9 +20,9 @@ from tdanet_jax import words
 from tdanet_jax.agent.base import BaseAgent, Decision, sigmoid, softmax, without
 from tdanet_jax.agent.detection import Detection
 from tdanet_jax.decisions import OWN_DECISIONS, Decisions
-from tdanet_jax.io.untrusted import FileError, npz
+from tdanet_jax.io.untrusted import FileError, jsons, npz
 from tdanet_jax.labels import Synonyms
-from tdanet_jax.observation_spec import TRACKING, ObservationSpec
+from tdanet_jax.observation_spec import TRACKING, ObservationSpec, Rows
 from tdanet_jax.poses import ITHOR, PoseGrid
 from tdanet_jax.sensors import numpy_sensors
 from tdanet_jax.sensors.shared import MeasuredPose
@@ -34,6 +33,7 @@ from tdanet_jax.words import WordVectors
 META_FILE, MODEL_FILE, WORDS_FILE = "meta.json", "model.npz", "words.npz"
 #: Version of the files' layout; `load` refuses another one.
 FORMAT = 1
+MOST = 1e6  # a number in `meta.json` is at most as large
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Meta:
     """What `meta.json` says."""
 
     classes: tuple[str, ...]  # class names, in the order of the run's vocabulary
-    rows: str  # as in ObservationSpec
+    rows: Rows  # as in ObservationSpec
     sensors: tuple[str, ...]
     scores: bool
     word_norm: float  # length to which the vectors of names are scaled
@@ -59,8 +59,7 @@ class Meta:
     @property
     def spec(self) -> ObservationSpec:
         """What the agent is shown."""
-        rows: Any = self.rows
-        return ObservationSpec(rows=rows, sensors=self.sensors, scores=self.scores)
+        return ObservationSpec(rows=self.rows, sensors=self.sensors, scores=self.scores)
 
 
 #: The fields of `meta.json` and their types in JSON.
@@ -289,8 +288,8 @@ def load(
         if shape != expected.get(name) or weights[name].dtype != np.float32:
             wanted = f"float32 {expected[name]}" if name in expected else "a parameter"
             raise FileError(folder / MODEL_FILE, f"{name} is {shape}, not {wanted}")
-    if isinstance(synonyms, str | Path):
-        synonyms = _read_json(Path(synonyms))
+        if not np.isfinite(weights[name]).all():
+            raise FileError(folder / MODEL_FILE, f"{name} is not finite")
     return NumPyAgent(meta, weights, vectors, grid, synonyms, more_words)
 
 
@@ -329,7 +328,7 @@ def shapes(meta: Meta, word: int) -> dict[str, tuple[int, ...]]:
 
 
 def _read_meta(path: Path) -> Meta:
-    values = _read_json(path)
+    values = jsons.load(path)
     values = {**_DEFAULTS, **values} if isinstance(values, dict) else values
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise FileError(path, f"not an agent in the format that this version reads, {FORMAT}")
@@ -343,22 +342,25 @@ def _read_meta(path: Path) -> Meta:
         raise FileError(path, f"no sensor is called {min(unknown)}")
     if values["reach_units"] and not {*TRACKING} & {*values["sensors"]}:
         raise FileError(path, "reach_units: needs triangulation among the sensors")
+    if len({*values["sensors"]}) < len(values["sensors"]):
+        raise FileError(path, "sensors: one is listed twice")
+    if values["rows"] not in get_args(Rows):
+        raise FileError(path, f"rows {values['rows']}: must be {' or '.join(get_args(Rows))}")
+    for number in (values["word_norm"], *values["target_box"]):
+        jsons.number(path, number, "word_norm, or one of target_box,", MOST)
+    if values["word_norm"] <= 0:
+        raise FileError(path, "word_norm is not positive")
+    lists = {name: tuple(values[name]) for name, kind in _KINDS.items() if kind is list}
+    meta = Meta(**{name: values[name] for name in _KINDS} | lists)
     names = [field.name for field in dataclasses.fields(Decisions)]
     try:
         Decisions(**{name: values[name] for name in names}).check()
+        meta.spec.check()
     except ValueError as error:
         raise FileError(path, error) from None
-    lists = {name: tuple(values[name]) for name, kind in _KINDS.items() if kind is list}
-    return Meta(**{name: values[name] for name in _KINDS} | lists)
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FileError(path, error.strerror) from None
-    except ValueError as error:
-        raise FileError(path, f"not JSON ({error})") from None
+    if len(meta.target_box) != meta.spec.columns:
+        raise FileError(path, f"target_box is not {meta.spec.columns} numbers")
+    return meta
 
 
 def _relu(x: np.ndarray) -> np.ndarray:
