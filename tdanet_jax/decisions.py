@@ -39,13 +39,19 @@ class Decisions(Settings):
         values = {name: getattr(self, name) for name in _RANGES}
         return {name: value for name, value in values.items() if value is not None}
 
-    def check(self) -> None:
-        """Raises ValueError, with one line that names the flag, if a value is out of range."""
+    def check(self, policy: object = None) -> None:
+        """Raises ValueError, with one line that names the flag, if a value is out of range.
+
+        Args:
+          policy: how actions are chosen; "greedy" has no temperature.
+        """
         self.check_types()
         for name, value in self.replaced.items():
             holds, wanted = _RANGES[name]
             if not holds(value):
                 raise ValueError(f"--{name.replace('_', '-')} {value}: must {wanted}")
+        if policy == "greedy" and self.temperature is not None:
+            raise ValueError("--temperature: has no effect on --policy greedy")
 
 
 #: The run's own.

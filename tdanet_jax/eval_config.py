@@ -55,9 +55,7 @@ class EvalConfig(Settings):
           seed: of sampled actions.
         """
         self.check_types()
-        self.decisions.check()
-        if policy == "greedy" and self.decisions.temperature is not None:
-            raise ValueError("--temperature: has no effect on --policy greedy")
+        self.decisions.check(policy)
         if seed is not None:
             check_seed(seed)
         for name, value in (("step-limit", self.step_limit), ("episodes", self.episodes)):

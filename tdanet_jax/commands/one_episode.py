@@ -75,7 +75,7 @@ def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
     if not runs:
         fail("give --checkpoint, the folder of a run")
     configs.check_seed(choice.seed)
-    choice.decisions.check()
+    choice.decisions.check(choice.policy)
     if choice.start is not None:
         start = f"--start {' '.join(map(str, choice.start))}"
         if not all(map(math.isfinite, choice.start)):
@@ -87,8 +87,20 @@ def check(choice: Choice, runs: Sequence[Path], required: bool = True) -> None:
     if choice.episode is not None:
         if (choice.scene, choice.target, choice.start) != (None, None, None):
             fail("--episode takes no --scene, --target or --start")
+        _check_recorded(choice, runs)
     elif (choice.scene is None or choice.target is None) and (required or choice.given):
         fail("give --scene and --target, or --episode")
+
+
+def _check_recorded(choice: Choice, runs: Sequence[Path]) -> None:
+    """Fails if what was recorded is not the first run's, or if a flag of play plays nothing."""
+    if folder_of(runs[0]) != runs[0]:
+        fail(f"--checkpoint {runs[0]}: give the run; its episodes are those of its last network")
+    given = [name for name in ("seed", "policy") if getattr(choice, name) != getattr(Choice, name)]
+    given += choice.decisions.replaced
+    if len(runs) == 1 and given:
+        flag = given[0].replace("_", "-")
+        fail(f"--{flag}: has no effect on --episode, which is shown as recorded")
 
 
 def rooms_of(choice: Choice, runs: Sequence[Path]) -> Rooms:

@@ -21,7 +21,8 @@ class Command(one_episode.Comparison):
     """Draws the paths of one or several agents through the same episode on the floor plan."""
 
     out: Path = Path("trajectories.png")
-    """Picture to write (.png, .pdf, .svg), or an animation (.gif) with the camera's view."""
+    """Picture to write (.png, .pdf, .svg or another format of Matplotlib), or an animation (.gif)
+    with the camera's view."""
 
 
 def main(arguments: list[str] | None = None) -> None:

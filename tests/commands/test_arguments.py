@@ -178,6 +178,21 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint bare --episode 3 --scene X", "--episode takes no --scene, --target or"),
         ("--checkpoint bare --scene FloorPlan1 --target Mug", "bare/checkpoints: no checkpoint"),
         ("--checkpoint bare --episode 3 --out full", "--out full: is a folder"),
+        (
+            "--checkpoint bare/history/00000020.npz --episode 3",
+            "--checkpoint bare/history/00000020.npz: give the run",
+        ),
+        ("--checkpoint bare --episode 3 --seed 5", "--seed: has no effect on --episode"),
+        ("--checkpoint bare --episode 3 --policy greedy", "--policy: has no effect on --episode"),
+        ("--checkpoint bare --episode 3 --done-bias 1", "--done-bias: has no effect on --episode"),
+        (
+            "--checkpoint bare --checkpoint bare --episode 3 --seed 5 --done-bias 1",
+            "bare/checkpoints: no checkpoint",  # the second plays
+        ),
+        (
+            "--checkpoint bare --scene FloorPlan1 --target Mug --policy greedy --temperature 0.5",
+            "--temperature: has no effect on --policy greedy",
+        ),
         ("--checkpoint bare --episode 3 --out x.gif", "--out x.gif: end it in .html"),
         ("--checkpoint bare --episode 3 --out full/file/a.html", "full/file/a.html: Not a"),
         ("--checkpoint bare --episode x", "invalid literal for int() with base 10: 'x'"),
