@@ -252,12 +252,13 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
     """Shows progress with `report(share, figures)`: a live bar on a terminal, otherwise lines.
 
     Lines are at least ten seconds apart, except for the first and the last; the time left is
-    estimated from the pace since the first.
+    estimated from the pace since the first. A share below the last one starts again.
 
     Args:
       title: the name of the work.
       transient: on a terminal, remove the bar at the end.
     """
+    last = 0.0  # share of the last report
     if console.is_terminal:
         columns = (
             TextColumn("{task.description}"),
@@ -271,6 +272,10 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
             task = bar.add_task(title, total=1.0, figures="")
 
             def live(share: float, figures: str) -> None:
+                nonlocal last
+                if share < last:
+                    bar.reset(task)
+                last = share
                 bar.update(task, completed=min(share, 1.0), figures=in_line(figures))
 
             yield live
@@ -279,8 +284,11 @@ def reporter(title: str, transient: bool = False) -> Iterator[Callable[[float, s
     printed = 0.0
 
     def plain(share: float, figures: str) -> None:
-        nonlocal first, printed
+        nonlocal first, printed, last
         now, share, left = time.monotonic(), min(share, 1.0), ""
+        if share < last:
+            first = None
+        last = share
         if first is not None and now - printed < SECONDS_BETWEEN_LINES and share < 1.0:
             return
         if first is None:

@@ -353,8 +353,8 @@ def write_report(
         unfinished = [folder for folder in begun if folder not in done]
         check_alike(runs)
         with reporter("histories") as show:
-            for run, points in sweep.histories(runs, out):
-                show(points / max(run.config.history, points), run.folder.name)
+            for run, part in sweep.histories(runs, out):
+                show(part, run.folder.name)
         curves = sweep_report.make_curves(runs, out)
         console.print("measuring inference ...")
         found = sweep_report.Report(

@@ -172,11 +172,11 @@ def labels(runs: Sequence[FinishedRun]) -> list[str]:
     return comparison.labels([run.results for run in runs], [run.folder.name for run in runs])
 
 
-def histories(runs: Sequence[FinishedRun], out: Path | str) -> Iterator[tuple[FinishedRun, int]]:
+def histories(runs: Sequence[FinishedRun], out: Path | str) -> Iterator[tuple[FinishedRun, float]]:
     """Evaluates the histories that are not evaluated yet, into `out`/histories/<run>.json.
 
     Actions are sampled with each run's own seed, so that its last point has the run's results.
-    Yields, after each point, its run and how many of the run's points are done.
+    Yields, after each point, its run and the share of all points that are done.
 
     Raises:
       ValueError: a point cannot be read, or belongs to other rooms.
@@ -191,7 +191,7 @@ def histories(runs: Sequence[FinishedRun], out: Path | str) -> Iterator[tuple[Fi
             waiting[run.folder] = (run, saved_networks.find(run.folder, with_history=True))
     done: dict[Path, list[Result]] = {folder: [] for folder in waiting}
     networks = [network for _, members in waiting.values() for network in members]
-    for one in saved_networks.evaluate(networks, greedy=False):
+    for count, one in enumerate(saved_networks.evaluate(networks, greedy=False), 1):
         folder = one.saved.run
         run, members = waiting[folder]
         done[folder].append(one.results())
@@ -199,7 +199,7 @@ def histories(runs: Sequence[FinishedRun], out: Path | str) -> Iterator[tuple[Fi
             (out / HISTORIES).mkdir(exist_ok=True)
             kept = {"of": _fingerprint(run), "results": done[folder]}
             files.write_text(out / HISTORIES / f"{folder.name}.json", json.dumps(kept) + "\n")
-        yield run, len(done[folder])
+        yield run, count / len(networks)
 
 
 def evaluated_history(run: FinishedRun, out: Path | str) -> list[Result] | None:

@@ -54,6 +54,36 @@ def test_a_slow_report_is_a_line_each(
     assert capsys.readouterr().out.splitlines() == ["training  25.0 %"] * 3
 
 
+def test_a_share_that_falls_starts_again(
+    clock: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with console.reporter("rooms") as show:
+        for phase in (0, 100):
+            for second in (0, 20, 40):
+                clock[0] = 1000.0 + phase + second
+                show(second / 40, "ready")
+    assert capsys.readouterr().out.splitlines() == [
+        "rooms   0.0 %  ready",
+        "rooms  50.0 %  ready  0:00:20 left",
+        "rooms 100.0 %  ready",
+    ] * 2  # fmt: skip
+
+
+def test_a_bar_starts_again(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = console.PlainConsole(file=io.StringIO(), force_terminal=True, width=120)
+    monkeypatch.setattr(console, "console", terminal)
+    bars, make = [], console.Progress
+    monkeypatch.setattr(
+        console, "Progress", lambda *a, **k: bars.append(make(*a, get_time=lambda: clock[0], **k))
+        or bars[0],
+    )  # fmt: skip
+    with console.reporter("rooms") as show:
+        for second, share in ((0, 0.0), (10, 0.5), (20, 1.0), (100, 0.0), (110, 0.25), (120, 0.5)):
+            clock[0] = 1000.0 + second
+            show(share, "")
+        assert bars[0].tasks[0].time_remaining == 20
+
+
 def strike() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 

@@ -138,9 +138,9 @@ def evaluate_history(monkeypatch, run, out):
         return map(Played, networks)
 
     monkeypatch.setattr(saved_networks, "evaluate", play)
-    done = [points for _, points in sweep.histories([run], out)]
+    shares = [share for _, share in sweep.histories([run], out)]
     assert len(sweep.evaluated_history(run, out)) == 2
-    return done == [1, 2]
+    return shares == [0.5, 1.0]
 
 
 def test_an_evaluated_history_counts_while_it_is_that_of_the_run(tmp_path, monkeypatch):
