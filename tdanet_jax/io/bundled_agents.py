@@ -6,6 +6,18 @@ from pathlib import Path
 
 #: How a point of a run's history ends: `history/<updates>.npz`.
 SUFFIX = ".npz"
+#: The agents that are shipped. In a checkout, there may be others in the same folder.
+SHIPPED = (
+    "14-8-best",
+    "14-8-paper-inputs",
+    "18-4-best",
+    "18-4-paper-inputs",
+    "18-4-robust",
+    "18-4-tdanet",
+    "22-0-best",
+    "22-0-paper-inputs",
+    "open-best",
+)
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -41,5 +53,5 @@ def folder_of(run: Path | str) -> Path:
 
 
 def is_bundled(run: Path) -> bool:
-    """Whether a run is a bundled agent; nothing should be written into its folder."""
-    return run.resolve().parent == folder().resolve()
+    """Whether a run is one of the shipped agents; nothing should be written into its folder."""
+    return run.resolve().parent == folder().resolve() and run.resolve().name in SHIPPED
