@@ -65,6 +65,8 @@ OWN = {
     "--log": "none",
     "--tensorboard": "none",
 }
+#: Fields of `Command` that say what to train.
+TRAINED = ("splits", "models", "seeds", "per_model", "vmap_seeds")
 #: Flags of the training command that all models of a sweep share.
 SHARED = ("--out", "--devices", "--data", "--targets", "--validation")
 
@@ -110,8 +112,8 @@ def main(arguments: list[str] | None = None) -> None:
                 prog="tdanet sweep",
                 description=__doc__,
             )
-        if command.report_only and rest:
-            fail(f"--report-only trains nothing and takes no {rest[0]}")
+        if command.report_only and (given := [*rest[:1], *given_of(command, TRAINED)]):
+            fail(f"--report-only trains nothing and takes no {given[0]}")
         check_own(rest)
         training = parse_command(rest)
         base, per_model = training.run.normalised(), parse_per_model(command, rest)
@@ -133,6 +135,12 @@ def main(arguments: list[str] | None = None) -> None:
         check_folder(command.out)
         with output_may_break():
             run(command, training, configs, included, shlex.join(["tdanet", "sweep", *words]))
+
+
+def given_of(command: Command, names: Sequence[str]) -> list[str]:
+    """The flags among these fields whose values are not the defaults."""
+    given = (name for name in names if getattr(command, name) != getattr(Command, name))
+    return [f"--{name.replace('_', '-')}" for name in given]
 
 
 def share(command: Command, configs: Sequence[TrainConfig]) -> list[TrainConfig]:

@@ -183,6 +183,24 @@ def test_several_processes_without_shares_are_refused(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--splits 14/8",
+        "--models ssnet",
+        "--seeds 5",
+        "--per-model tdanet:--steps=1",
+        "--vmap-seeds",
+    ],
+)
+def test_a_report_alone_takes_no_flag_of_what_to_train(tmp_path, capsys, words):
+    with pytest.raises(SystemExit):
+        sweep.main(["--report-only", *words.split(), "--out", str(tmp_path)])
+    assert (
+        f"--report-only trains nothing and takes no {words.split()[0]}" in capsys.readouterr().err
+    )
+
+
 @pytest.fixture
 def trained(monkeypatch):
     """What is trained without training: the folders, in order; the reports have made-up results."""
