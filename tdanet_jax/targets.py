@@ -19,13 +19,13 @@ ALL = "all"
 
 
 @contextlib.contextmanager
-def naming(flag: str) -> Iterator[None]:
-    """Errors inside that begin with --targets begin with this flag instead."""
+def naming(flag: str, instead_of: str = "--targets") -> Iterator[None]:
+    """Errors inside that begin with another flag, by default --targets, begin with this one."""
     try:
         yield
     except ValueError as error:
         head, _, rest = str(error).partition(" ")
-        if head != "--targets":
+        if head != instead_of:
             raise
         raise ValueError(f"{flag} {rest}") from None
 

@@ -35,6 +35,7 @@ from tdanet_jax.commands.console import (
     parse,
 )
 from tdanet_jax.config import PRESETS, NetworkConfig, TrainConfig
+from tdanet_jax.targets import naming
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
@@ -52,6 +53,13 @@ TRAINED = ("rollout", "update", "profile")
 BUNDLED = "18-4-best"
 #: What is measured if `--parts` is not given: all that takes no training.
 SHORT = tuple(part for part in get_args(Part) if part != "quality")
+#: Flags of the `quality` part, and what the training command calls them.
+OWN_NAMES = (
+    ("--units", "--width"),
+    ("--units", "--hidden"),
+    ("--most-steps", "--steps"),
+    ("--seeds", "--seed"),
+)
 Precision = Literal["auto", "float32", "bfloat16"]
 
 
@@ -157,8 +165,11 @@ def main(arguments: list[str] | None = None) -> None:
             num_envs=1 if command.num_envs is None else command.num_envs,
             units=1 if command.units is None else command.units,
         )
-        for config in command.trained():
-            config.check()
+        with contextlib.ExitStack() as named:
+            for ours, instead_of in OWN_NAMES:
+                named.enter_context(naming(ours, instead_of))
+            for config in command.trained():
+                config.check()
         for name in command.models:
             command.config(name).check()
         command.check_parts()

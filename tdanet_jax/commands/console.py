@@ -244,7 +244,7 @@ def check_positive(**flags: int | Sequence[int]) -> None:
     for name, given in flags.items():
         for value in (given,) if isinstance(given, int) else given:
             if value < 1:
-                fail(f"--{name} {value}: must be positive")
+                fail(f"--{name.replace('_', '-')} {value}: must be positive")
 
 
 @contextlib.contextmanager

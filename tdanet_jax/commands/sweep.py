@@ -42,7 +42,7 @@ from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
 from tdanet_jax.eval_config import OWN_TASK, rooms_played
 from tdanet_jax.io import files
 from tdanet_jax.splits import file_name
-from tdanet_jax.targets import PAPER
+from tdanet_jax.targets import PAPER, naming
 from tdanet_jax.training import cluster
 from tdanet_jax.workflows import sweep, sweep_report
 from tdanet_jax.workflows.sweep import FinishedRun
@@ -263,7 +263,8 @@ def train_all(
     for asked in configs:
         folder = command.out / run_name(asked)
         config = sweep.settled(command.out, asked)
-        model, learner = make_model(config, ClassVocabulary()), config.learner
+        with naming("--models", "--model"):
+            model, learner = make_model(config, ClassVocabulary()), config.learner
         devices.check_divides(learner.num_envs, mesh, minibatches=learner.num_minibatches)
         progress = sweep.progress(folder, config)
         if progress == "new":

@@ -21,7 +21,7 @@ from tdanet_jax.evaluation.comparison import Result
 from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import jsons, npz
 from tdanet_jax.splits import split_name
-from tdanet_jax.targets import known_classes
+from tdanet_jax.targets import known_classes, naming
 
 #: Settings of the network that can be "auto".
 AUTO = ("precision", "image")
@@ -48,7 +48,9 @@ def plan(
     Raises:
       ValueError: a value is not allowed or given twice; the message names the flag.
     """
-    splits = [split_name(split, known_classes(base.targets, base.data)) for split in splits]
+    classes = known_classes(base.targets, base.data)
+    with naming("--splits", "--split"):
+        splits = [split_name(split, classes) for split in splits]
     for flag, given in (("--splits", splits), ("--models", models), ("--seeds", seeds)):
         if not given:
             raise ValueError(f"{flag}: give at least one")
@@ -61,8 +63,13 @@ def plan(
         for model in models
         for seed in seeds
     ]
-    for config in out:
-        config.check()
+    with (
+        naming("--splits", "--split"),
+        naming("--models", "--model"),
+        naming("--seeds", "--seed"),
+    ):
+        for config in out:
+            config.check()
     return out
 
 

@@ -53,8 +53,8 @@ def test_a_model_may_have_a_configuration_of_its_own():
         ((), ("tdanet",), (0,), "--splits: give at least one"),
         (("18/4",), ("tdanet", "tdanet"), (0,), "--models: a value is given twice"),
         (("18/4",), ("tdanet",), (0, 0), "--seeds: a value is given twice"),
-        (("18/5",), ("tdanet",), (0,), "--split 18/5"),
-        (("18/4",), ("cnn",), (0,), "--model cnn"),
+        (("18/5",), ("tdanet",), (0,), "--splits 18/5"),
+        (("18/4",), ("cnn",), (0,), "--models cnn"),
     ],
 )
 def test_a_wrong_plan_names_the_flag(splits, models, seeds, message):
