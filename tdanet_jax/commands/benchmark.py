@@ -227,7 +227,9 @@ def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
                 yield benchmarking.environment_row(task, count, observed, command.repeats, mesh)
     if "evaluation" in command.parts:
         for networks in command.networks:
-            yield benchmarking.evaluation_row(command.checkpoint, task, networks, command.repeats)
+            yield benchmarking.evaluation_row(
+                command.checkpoint, task, networks, command.repeats, command.data
+            )
     sensors = {"odometry": command.odometry, "triangulation": command.triangulation}
     for name in command.models:
         for row in model_rows(command, name, peak):

@@ -27,6 +27,7 @@ from tdanet_jax.agent.detection import Detection
 from tdanet_jax.config import LearnerConfig
 from tdanet_jax.env import dynamics
 from tdanet_jax.env.types import EnvParams, Observation
+from tdanet_jax.eval_config import EvalConfig
 from tdanet_jax.evaluation import episodes, policies, rollout, saved_networks
 from tdanet_jax.models import actor_critic, parameter_count
 from tdanet_jax.models.actor_critic import ActorCritic
@@ -223,7 +224,9 @@ def update_cost(
     }
 
 
-def evaluation_row(run: Path | None, task: Task, networks: int, repeats: int) -> Row:
+def evaluation_row(
+    run: Path | None, task: Task, networks: int, repeats: int, data: str | None = None
+) -> Row:
     """All episodes of a split with sampled actions, for several networks in one call.
 
     Args:
@@ -232,11 +235,12 @@ def evaluation_row(run: Path | None, task: Task, networks: int, repeats: int) ->
       task: what an untrained network plays.
       networks: number of networks.
       repeats: number of repetitions.
+      data: file of rooms in which a trained network plays; by default, its own.
     """
     if run is None:
         weights = task.model.initialise(jax.random.key(0), task.words)
     else:
-        network = saved_networks.find(run)[0]
+        network = saved_networks.find(run, test=EvalConfig(data=data))[0]
         task, weights = load_task(network.located), network.load().weights
         history.check_fit(run, weights, task.model.parameter_shapes(*task.words.shape))
     stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * networks), weights)

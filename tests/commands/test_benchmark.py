@@ -5,6 +5,7 @@ import json
 import pytest
 
 from tdanet_jax.commands import benchmark
+from tdanet_jax.tools import benchmarking
 from tests.agent.test_agent import OLD_RUN
 
 
@@ -86,6 +87,11 @@ def test_a_robots_steps_are_timed_with_jax_and_without(ithor, tmp_path):
     assert all(value > 0 for value in row.values())
     assert row["seconds_to_first_action_without_jax"] < row["seconds_to_first_action"]
     assert row["milliseconds_100_robots"] < 100 * row["milliseconds"]
+
+
+def test_a_trained_network_plays_in_the_rooms_that_are_given():
+    with pytest.raises(ValueError, match=r"nowhere.npz: no such file"):
+        benchmarking.evaluation_row(OLD_RUN, None, 1, 1, "nowhere.npz")
 
 
 @pytest.mark.slow
