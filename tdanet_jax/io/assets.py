@@ -47,8 +47,8 @@ def path(name: str) -> Path:
     if not file.is_file():
         raise AssetError(f"{file}: missing; reinstall tdanet_jax")
     try:
-        expected = json.loads((root / CHECKSUMS).read_text()).get(name)
-    except (json.JSONDecodeError, AttributeError):
+        expected = json.loads((root / CHECKSUMS).read_text(encoding="utf-8")).get(name)
+    except (ValueError, AttributeError):
         raise AssetError(f"{root / CHECKSUMS}: not a JSON object; reinstall tdanet_jax") from None
     if expected is None:
         raise AssetError(f"{root / CHECKSUMS}: no checksum for {name}; reinstall tdanet_jax")

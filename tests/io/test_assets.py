@@ -61,9 +61,9 @@ def test_unlisted(folder: Path) -> None:
     one_line(error, "b.npz")
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{"])
-def test_broken_list(folder: Path, content: str) -> None:
-    (folder / assets.CHECKSUMS).write_text(content)
+@pytest.mark.parametrize("content", [b"", b"[]", b"{", b"\xff\xfe"])
+def test_broken_list(folder: Path, content: bytes) -> None:
+    (folder / assets.CHECKSUMS).write_bytes(content)
     with pytest.raises(AssetError, match=r"checksums\.json"):
         assets.path("a.npz")
 
