@@ -20,9 +20,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, TextIO, get_args
 
 from rich.table import Table
 
@@ -183,8 +183,10 @@ def main(arguments: list[str] | None = None) -> None:
         if "environment" in command.parts:
             for count in command.environments:
                 devices.check_divides(count, mesh, "environments")
-        rows = []
-        with contextlib.nullcontext() if command.out is None else command.out.open("x") as file:
+        rows: list[Row] = []
+        with (
+            contextlib.nullcontext() if command.out is None else written(command.out, rows) as file
+        ):
             for row in measure(command, mesh):
                 rows.append(row)
                 line = json.dumps(row)
@@ -193,6 +195,18 @@ def main(arguments: list[str] | None = None) -> None:
                     file.write(line + "\n")
                     file.flush()
         console.print(as_table(rows))
+
+
+@contextlib.contextmanager
+def written(out: Path, rows: Sequence[Row]) -> Iterator[TextIO]:
+    """A new file for `rows`; removed on an error before there is a result, for the next try."""
+    with out.open("x") as file:
+        try:
+            yield file
+        except BaseException:
+            if len(rows) <= 1:  # the first says which machine it is
+                out.unlink()
+            raise
 
 
 def measure(command: Command, mesh: Mesh) -> Iterator[Row]:

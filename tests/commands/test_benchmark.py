@@ -33,6 +33,7 @@ def test_a_wrong_folder_ends_before_anything_is_measured(tmp_path, capsys):
     for flags in (
         ["--parts", "machine", "agent", "--checkpoint", "nowhere", "--out", str(out)],
         ["--parts", "machine", "--out", "nowhere/figures.jsonl"],
+        ["--parts", "evaluation", "--data", "nowhere.npz", "--out", str(out)],
     ):
         with pytest.raises(SystemExit) as ended:
             benchmark.main(flags)
