@@ -35,6 +35,8 @@ Arguments = TypeVar("Arguments")
 
 #: Without a terminal, progress is a line at most this often.
 SECONDS_BETWEEN_LINES = 10.0
+#: What JAX calls its own error, now and in older versions.
+OF_JAX = ("JaxRuntimeError", "XlaRuntimeError")
 #: Columns from which a terminal has room for a bar next to the figures of training.
 WIDE = 104
 
@@ -153,8 +155,12 @@ def parse(
 
 
 @contextlib.contextmanager
-def one_line_errors() -> Iterator[None]:
-    """Reduces warnings, user errors (ValueError, OSError) and signals to one line each."""
+def one_line_errors(if_memory_ends: str = "") -> Iterator[None]:
+    """Reduces warnings, user errors (ValueError, OSError) and signals to one line each.
+
+    Args:
+      if_memory_ends: what helps if there is not enough memory, which is a line, too.
+    """
     with warnings.catch_warnings(), StopRequest().receiving():
         warnings.showwarning = _show_warning  # type: ignore[assignment]
         # Without a home, Matplotlib would add its own long warning to the one about our cache.
@@ -166,9 +172,19 @@ def one_line_errors() -> Iterator[None]:
             fail(f"{error.filename}: {error.strerror}" if error.filename else error)
         except ValueError as error:
             fail(error)
+        except RuntimeError as error:
+            if (wanted := _not_enough(error)) is None:
+                raise
+            fail("; ".join(part for part in (f"out of memory: {wanted}", if_memory_ends) if part))
         except Stopped as stopped:
             print("stopped", file=sys.stderr)
             stopped.answer()
+
+
+def _not_enough(error: RuntimeError) -> str | None:
+    """What JAX says of memory that it did not get; None of other errors. Does not import JAX."""
+    said = re.match(r"RESOURCE_EXHAUSTED: (?:Out of memory\s*)?(.*?)\.?$", str(error), re.M)
+    return said[1] if said and type(error).__name__ in OF_JAX else None
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:

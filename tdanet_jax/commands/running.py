@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from tdanet_jax.training.run import Run
 
 
+#: What helps a training that does not fit into memory.
+IF_MEMORY_ENDS = "fewer --num-envs, or more --num-minibatches"
+
+
 @dataclasses.dataclass(frozen=True)
 class Command:
     """Trains an agent on the iTHOR training rooms and reports SR and SPL in the test rooms."""

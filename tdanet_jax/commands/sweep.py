@@ -35,8 +35,8 @@ from tdanet_jax.commands.console import (
     one_line_usage,
     reporter,
 )
+from tdanet_jax.commands.running import IF_MEMORY_ENDS, how_to_continue, parse_command, stoppable
 from tdanet_jax.commands.running import Command as TrainingCommand
-from tdanet_jax.commands.running import how_to_continue, parse_command, stoppable
 from tdanet_jax.commands.streams import output_may_break
 from tdanet_jax.config import CONFIG_FILE, TrainConfig, run_name
 from tdanet_jax.eval_config import OWN_TASK, rooms_played
@@ -103,7 +103,7 @@ class Command:
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     words = sys.argv[1:] if arguments is None else arguments
-    with one_line_errors():
+    with one_line_errors(IF_MEMORY_ENDS):
         with one_line_usage():
             command, rest = tyro.cli(
                 Command,

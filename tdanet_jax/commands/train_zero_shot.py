@@ -16,7 +16,14 @@ import time
 from pathlib import Path
 
 from tdanet_jax.commands.console import check_positive, console, fail, one_line_errors
-from tdanet_jax.commands.running import Command, how_to_continue, parse_command, stoppable, trust
+from tdanet_jax.commands.running import (
+    IF_MEMORY_ENDS,
+    Command,
+    how_to_continue,
+    parse_command,
+    stoppable,
+    trust,
+)
 from tdanet_jax.commands.streams import output_may_break
 from tdanet_jax.config import TrainConfig, run_name
 from tdanet_jax.io import files
@@ -27,7 +34,7 @@ from tdanet_jax.training.journal import check_log
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command."""
     words = sys.argv[1:] if arguments is None else arguments
-    with one_line_errors():
+    with one_line_errors(IF_MEMORY_ENDS):
         command = parse_command(words)
         config = check(command)
         folder = command.resume or command.out or default_folder(config)

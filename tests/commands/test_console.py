@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import jax
 import pytest
 from jax._src import xla_bridge
 
@@ -244,6 +245,25 @@ def test_names_from_files_are_printed_as_they_are(capsys: pytest.CaptureFixture[
     assert capsys.readouterr().err == (
         "warning: [/x]?[2J warning: more\nerror: [/x]?[2J error: more\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("advice", "said"),
+    [
+        ("", "error: out of memory: allocating 40 bytes\n"),
+        ("fewer --num-envs", "error: out of memory: allocating 40 bytes; fewer --num-envs\n"),
+    ],
+)
+def test_memory_that_does_not_suffice_is_one_line(
+    advice: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "RESOURCE_EXHAUSTED: Out of memory allocating 40 bytes.\nA list of buffers"
+    with pytest.raises(SystemExit), console.one_line_errors(advice):
+        raise jax.errors.JaxRuntimeError(text)
+    assert capsys.readouterr().err == said
+    for other in (jax.errors.JaxRuntimeError("INTERNAL: a fault"), RuntimeError(text)):
+        with pytest.raises(RuntimeError), console.one_line_errors(advice):
+            raise other
 
 
 @pytest.mark.parametrize(("width", "bar"), [(80, False), (120, True)])
