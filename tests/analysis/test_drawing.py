@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from matplotlib.figure import Figure
 
 from tdanet_jax.analysis import drawing
@@ -111,3 +112,11 @@ def test_a_path_grows_step_by_step(some_rooms):
 def test_more_attention_is_darker_in_grey():
     grey = [np.dot(drawing.SHADES(share)[:3], (0.3, 0.59, 0.11)) for share in (0.0, 0.25, 0.5, 1.0)]
     assert (np.diff(grey) < -0.1).all()
+
+
+@pytest.mark.parametrize("ending", drawing.formats())
+def test_pictures_are_written_in_every_format(tmp_path, ending):
+    figure = Figure(figsize=(1, 1))
+    drawing.draw_view(figure.subplots(), SEEN, None, "Mug")
+    drawing.save(figure, tmp_path / f"view.{ending}")
+    assert (tmp_path / f"view.{ending}").stat().st_size > 100
