@@ -20,7 +20,7 @@ from tdanet_jax import __main__ as tdanet
 from tests.support.pages import PAGES, ROOT, blocks
 
 #: Other programs that the pages may name.
-OTHERS = {"cd", "git", "mkdocs", "mypy", "ruff", "sha256sum", "."}
+OTHERS = {"mkdir", "cd", "git", "mkdocs", "mypy", "ruff", "sha256sum", "."}
 
 #: The functions that parse command lines.
 PARSERS: tuple[tuple[Any, str], ...] = (
