@@ -27,6 +27,7 @@ from typing import Any
 import tyro
 
 from tdanet_jax.commands.console import (
+    RunPath,
     check_folder,
     check_positive,
     console,
@@ -96,8 +97,8 @@ class Command:
     (docs/cluster.md)."""
     report_only: bool = False
     """Train nothing; report on the finished runs in --out and on --include."""
-    include: tuple[Path, ...] = ()
-    """Finished runs elsewhere to include in the report."""
+    include: tuple[RunPath, ...] = ()
+    """Finished runs elsewhere to include in the report, or bundled agents, by name."""
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -286,6 +286,13 @@ def test_a_sweep_whose_runs_are_all_in_other_processes_says_so(tmp_path, capsys,
     assert "no finished run to report on yet" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("trained")
+def test_a_bundled_agent_is_included_by_its_name(tmp_path):
+    sweep.main(["--report-only", "--include", "18-4-best", "--out", str(tmp_path)])
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [run["run"].rpartition("/")[2] for run in report["runs"]] == ["18-4-best"]
+
+
 def test_a_run_that_another_process_has_finished_meanwhile_is_not_trained_again(
     tmp_path, monkeypatch, trained
 ):
