@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shlex
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -166,11 +167,15 @@ def trust(config: TrainConfig) -> str:
     return f"{TRUST}={','.join(names)}" if names else ""
 
 
-def how_to_continue(folder: Path, config: TrainConfig) -> str:
-    """What to say to someone who has stopped a run."""
+def how_to_continue(
+    folder: Path, config: TrainConfig, device_count: int = 1, log: Sequence[str] = ()
+) -> str:
+    """What to say to someone who has stopped a run; the last two are not in the run's folder."""
     from tdanet_jax.training.checkpoint import Checkpoints
 
     if not (folder / CONFIG_FILE).exists():
         return "the run had not begun"
-    again = f"{trust(config)} tdanet train --resume {folder}".lstrip()
+    again = f"{trust(config)} tdanet train --resume {shlex.quote(str(folder))}".lstrip()
+    again += f" --devices {device_count}" if device_count > 1 else ""
+    again += f" --log {' '.join(log)}" if log else ""
     return f"{Checkpoints(folder).latest() or 0:,} updates are saved; continue with: {again}"

@@ -316,7 +316,8 @@ def train_members(
         return
     for config, folder in members:
         resume = (folder / CONFIG_FILE).exists()
-        with stoppable(functools.partial(how_to_continue, folder, config), typed) as reports:
+        advice = functools.partial(how_to_continue, folder, config, device_count)
+        with stoppable(advice, typed) as reports:
             train(config, folder, resume=resume, device_count=device_count, callbacks=reports)
 
 

@@ -39,7 +39,7 @@ def main(arguments: list[str] | None = None) -> None:
         config = check(command)
         folder = command.resume or command.out or default_folder(config)
         if command.resume is None and not cluster.several():
-            files.check_empty(folder, f" (to continue there: --resume {folder})")
+            files.check_empty(folder, f" (to continue there: --resume {shlex.quote(str(folder))})")
         with output_may_break():
             run(command, config, folder, shlex.join(["tdanet", "train", *words]))
 
@@ -87,7 +87,8 @@ def run(command: Command, config: TrainConfig, folder: Path, typed: str) -> None
       folder: where everything is written.
       typed: the command line, for `run.json`.
     """
-    with stoppable(lambda: how_to_continue(folder, config), typed) as reports:
+    flags = command.devices, command.sinks
+    with stoppable(lambda: how_to_continue(folder, config, *flags), typed) as reports:
         from tdanet_jax.workflows.train import train
 
         results = train(

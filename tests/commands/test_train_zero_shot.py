@@ -230,3 +230,22 @@ def free_port():
     with socket.socket() as listener:
         listener.bind(("localhost", 0))
         return listener.getsockname()[1]
+
+
+def test_who_stops_a_run_learns_how_to_continue_as_it_was_started(tmp_path, monkeypatch, capsys):
+    """In this folder, with these devices and logs: none of them is in the run."""
+    out = tmp_path / "my runs"
+
+    def train(config, folder, **options):
+        folder.mkdir()
+        (folder / "config.json").touch()
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("tdanet_jax.workflows.train.train", train)
+    with pytest.raises(SystemExit):
+        train_zero_shot.main(["--out", str(out), "--devices", "2", "--log", "csv"])
+    said = capsys.readouterr().out
+    assert f"continue with: tdanet train --resume '{out}' --devices 2 --log csv\n" in said
+    with pytest.raises(SystemExit):
+        train_zero_shot.main(["--out", str(out)])
+    assert f"(to continue there: --resume '{out}')" in capsys.readouterr().err
