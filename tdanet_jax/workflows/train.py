@@ -22,7 +22,7 @@ from tdanet_jax.io import files
 from tdanet_jax.io.untrusted import regular
 from tdanet_jax.models.factory import check_trained, unused_flags
 from tdanet_jax.scenes.dataset import idle_rooms
-from tdanet_jax.task import load_task, resolve
+from tdanet_jax.task import Task, load_task, resolve
 from tdanet_jax.training import checkpoint, devices, run_file
 from tdanet_jax.training.callbacks import Callbacks
 from tdanet_jax.training.journal import METRICS_FILE, SINKS, Row, check_log, read_metrics
@@ -83,11 +83,7 @@ def train(
     lists = episodes.load(task.tables, task.split, task.extras)  # errors show before training
     if not resume:
         check_trained(config, task.model)
-        idle = dict.fromkeys(unused_flags(config, task.classes), f"for {config.model}")
-        for flag, reason in {**idle, **configs.idle_flags(config)}.items():
-            callbacks.on_note(f"note: {flag} changes nothing {reason}")
-    if rooms := idle_rooms(task.tables, task.split):
-        callbacks.on_note(f"note: no target can be found in {name_ranges(rooms)}: left out")
+    _note(config, task, not resume, callbacks)
     # What "auto" means here is part of the run: it continues with the same products elsewhere.
     config = resolve(config)
     with files.locked(folder) if devices.is_lead() else contextlib.nullcontext():
@@ -118,6 +114,8 @@ def train_together(members: Sequence[tuple[TrainConfig, Path | str]], callbacks:
     with contextlib.ExitStack() as locks:
         task = load_task(_located(*pairs[0]), callbacks.on_rooms)
         lists = episodes.load(task.tables, task.split, task.extras)
+        new = any(not (folder / CONFIG_FILE).exists() for _, folder in pairs)
+        _note(pairs[0][0], task, new, callbacks)
         runs: list[Run] = []
         for config, folder in pairs:
             locks.enter_context(files.locked(folder))
@@ -129,6 +127,16 @@ def train_together(members: Sequence[tuple[TrainConfig, Path | str]], callbacks:
         if _learn(runs, chunks_together(runs), callbacks):
             for run in runs:
                 _report(run, lists, callbacks)
+
+
+def _note(config: TrainConfig, task: Task, new: bool, callbacks: Callbacks) -> None:
+    """Says which flags of a new run change nothing, and which rooms are left out."""
+    if new:
+        idle = dict.fromkeys(unused_flags(config, task.classes), f"for {config.model}")
+        for flag, reason in {**idle, **configs.idle_flags(config)}.items():
+            callbacks.on_note(f"note: {flag} changes nothing {reason}")
+    if rooms := idle_rooms(task.tables, task.split):
+        callbacks.on_note(f"note: no target can be found in {name_ranges(rooms)}: left out")
 
 
 def resumed(folder: Path | str, new: TrainConfig | None = None) -> TrainConfig:

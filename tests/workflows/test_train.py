@@ -69,7 +69,7 @@ def test_flags_that_change_nothing_are_noted(
         def on_note(self, text: str) -> None:
             said.append(text)
 
-    def begin(*arguments: Any) -> None:
+    def begin(*arguments: Any, **options: Any) -> None:
         raise ValueError("begun")
 
     said: list[str] = []
@@ -79,7 +79,10 @@ def test_flags_that_change_nothing_are_noted(
     )
     with pytest.raises(ValueError, match="begun"):
         train.train(config, tmp_path / "run", callbacks=Noting())
-    assert said == [
+    with pytest.raises(ValueError, match="begun"):  # and of seeds that train together, once
+        train.train_together([(config, tmp_path / "a"), (config, tmp_path / "b")], Noting())
+    notes = [
         "note: --inner-rate changes nothing for tdanet",
         "note: --clip-coef changes nothing with one optimiser step per update",
     ]
+    assert said == [*notes, *notes]
