@@ -80,7 +80,7 @@ def main(arguments: list[str] | None = None) -> None:
             fail(f"--split {command.split}: a run is evaluated on its own split")
         if trained and command.validation:
             fail("--validation: a trained run has its own rooms and classes")
-        if len(set(command.checkpoint)) < len(command.checkpoint):
+        if len({run.resolve() for run in command.checkpoint}) < len(command.checkpoint):
             fail("--checkpoint: a run is given twice")
         if len(command.checkpoint) > 1 and command.out is None:
             fail("several checkpoints need --out")

@@ -87,6 +87,7 @@ CASES: dict[str, list[tuple[str, str]]] = {
         ("--checkpoint full --validation", "--validation: a trained run has its own rooms"),
         ("--policy random --word-vectors x.txt", "x.txt: no such file"),
         ("--checkpoint a --checkpoint a", "--checkpoint: a run is given twice"),
+        ("--checkpoint full --checkpoint full/../full", "--checkpoint: a run is given twice"),
         ("--checkpoint a --checkpoint b", "several checkpoints need --out"),
         ("--policy random --step-limit 0", "--step-limit 0: must be positive"),
         ("--policy random --step-limit 1000000000", "must be at most 1,000,000"),
