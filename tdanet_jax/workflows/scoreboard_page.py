@@ -74,7 +74,7 @@ def filled(path: Path, text: str, rows: Sequence[Row]) -> str:
             raise FileError(path, f"{MARK}{block[1]} --> has no <!-- end -->")
         if block[1] in NAMED:
             lines = of_split(block[1], rows)
-        elif "*" in block[1]:
+        elif re.search(r"[*?[]", block[1]):  # what `fnmatch` heeds
             lines = of_agents([row for name in block[1].split() for row in named(name)])
         else:
             if unknown := [name for name in block[1].split() if name not in by_name]:

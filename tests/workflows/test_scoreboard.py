@@ -332,6 +332,8 @@ def test_runs_for_choosing_settings_stand_apart(of_validation: Path, tmp_path: P
         scoreboard_page.filled(
             Path("page.md"), "<!-- scoreboard: validation/no-* -->\n<!-- end -->\n", rows
         )
+    one = "<!-- scoreboard: 18-4-rando? -->\n<!-- end -->\n"
+    assert "<code>random</code>" in scoreboard_page.filled(Path("page.md"), one, rows)
 
 
 def test_a_table_of_agents_gives_the_flags_that_all_share_once() -> None:
