@@ -107,9 +107,11 @@ def build(out_dir: Path, wheels: Path | None = None) -> list[Path]:
     parent.mkdir(parents=True, exist_ok=True)
     with (
         tempfile.TemporaryDirectory() as downloads,
-        tempfile.TemporaryDirectory(prefix=files.PARTIAL, dir=parent) as temporary,
+        files.private_folder(parent) as temporary,
     ):
-        made = _build(Path(temporary), wheels or Path(downloads))
+        made_in = temporary / out_dir.absolute().name
+        made_in.mkdir()
+        made = _build(made_in, wheels or Path(downloads))
         out_dir.mkdir(exist_ok=True)
         return [path.replace(out_dir / path.name) for path in made]
 

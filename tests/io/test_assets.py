@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,9 @@ from typing import Any
 import pytest
 
 from tdanet_jax import labels, words
+from tdanet_jax.commands import scenes
 from tdanet_jax.evaluation import episodes
-from tdanet_jax.io import assets
+from tdanet_jax.io import assets, files
 from tdanet_jax.io.assets import AssetError
 from tdanet_jax.scenes import ithor
 from tdanet_jax.scenes.generation import catalogue
@@ -141,6 +143,25 @@ def test_bundled_files_are_replaced_when_all_new_ones_are_whole(
         assert set(json.loads(content.pop(assets.CHECKSUMS))) == content.keys()
         assert set(content.values()) == {"new"}
     assert [path.name for path in tmp_path.iterdir()] == ["assets"]
+
+
+def test_what_a_killed_build_left_is_removed_by_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    killed = tmp_path / f"{files.PARTIAL}999999999-x"  # a process that does not run
+
+    def build(folder: Path, wheels: Path) -> list[Path]:
+        shutil.copytree(folder.parent, killed)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(build_assets, "_build", build)
+    with pytest.raises(KeyboardInterrupt):
+        build_assets.build(tmp_path / "assets")
+    assert [*tmp_path.iterdir()] == [killed]
+    monkeypatch.setattr(build_assets, "build", lambda *given: [])
+    scenes.main(["build", "--out", str(tmp_path / "assets")])
+    assert [*tmp_path.iterdir()] == []
+    assert f"removed {killed}" in capsys.readouterr().out
 
 
 def test_a_wheel_with_other_content_is_refused(tmp_path: Path) -> None:

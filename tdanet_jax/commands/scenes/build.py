@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from tdanet_jax.commands.console import check_folder, console
+from tdanet_jax.commands.console import check_folder, console, remove_abandoned
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,6 +20,7 @@ class Build:
     def run(self) -> None:
         """Writes the files and lists them."""
         check_folder(self.out)
+        remove_abandoned(self.out.absolute())
         from tdanet_jax.tools import build_assets
 
         for path in build_assets.build(self.out, self.wheels):
