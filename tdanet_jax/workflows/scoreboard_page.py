@@ -115,15 +115,16 @@ def of_agents(rows: Iterable[Row]) -> list[str]:
     common = [flag for flag in flags[0] if all(flag in own for own in flags)]
     shared = len(agents) > 1 and len(common) > 1
     shown = []
-    for own, (agent, seeds) in zip(flags, agents.items(), strict=True):
-        rest = " ".join(flag for flag in own if flag not in common) if shared else agent
-        _, _, *cells = _of_agent(agent, seeds)
-        name = _code(rest) if rest else "as it is"
+    for own, seeds in zip(flags, agents.values(), strict=True):
+        rest = [flag for flag in own if flag not in common]
+        name, _, *cells = _of_agent(seeds)
+        if shared:
+            name = _code(" ".join(rest)) if rest else "as it is"
         shown.append(((name, *cells), comparison.summary([row.results for row in seeds])))
     table = comparison.table(
         (_HEADS[0], *_HEADS[2:]), shown, buckets=("L>=1",), measures=comparison.MEASURES
     )
-    said = [f"Each is {_code(' '.join(common))} with what its row says.", ""] if shared else []
+    said = [f"Each is {_named(common)} with what its row says.", ""] if shared else []
     return ["", *said, *table, ""]
 
 
@@ -146,7 +147,7 @@ def of_split(split: str, rows: Iterable[Row]) -> list[str]:
         agents, key=lambda agent: -(summaries[agent][present[-1]]["L>=1"]["SR"].mean)
     )
     published = paper.rates(split)
-    shown = [(_of_agent(agent, agents[agent]), summaries[agent]) for agent in best_first] + [
+    shown = [(_of_agent(agents[agent]), summaries[agent]) for agent in best_first] + [
         ((f"{agent} (paper)", "", "", "", ""), groups) for agent, groups in published.items()
     ]
     lines = comparison.table(_HEADS, shown, groups=present, measures=("SR", "SPL", "CF-SR"))
@@ -157,14 +158,14 @@ def of_split(split: str, rows: Iterable[Row]) -> list[str]:
     return ["", *lines, "", *_runs([row for agent in best_first for row in agents[agent]]), ""]
 
 
-def _of_agent(agent: str, seeds: Sequence[Row]) -> tuple[str, ...]:
+def _of_agent(seeds: Sequence[Row]) -> tuple[str, ...]:
     """The cells of an agent before its results."""
     steps = comparison.spread(row.results["steps"] / 1e6 for row in seeds)
     hours = [row.hours for row in seeds if row.hours is not None]
     trained = steps is not None and steps.mean > 0
     senses = seeds[0].senses
     return (
-        _code(agent),
+        _named(seeds[0].flags),
         "" if senses is None else ", ".join(map(in_markdown, senses)) or "none",
         ", ".join(str(row.results["seed"]) for row in seeds) if trained else "",
         f"{steps.mean:.1f} M" if steps is not None and trained else "",
@@ -186,6 +187,12 @@ def _runs(rows: Iterable[Row]) -> list[str]:
         )
         lines.append(f"| {' | '.join(cells)} |")
     return lines
+
+
+def _named(flags: Sequence[str]) -> str:
+    """A model and its flags (`Row.flags`), which are no command."""
+    model, *rest = flags
+    return " ".join([in_markdown(model), *[_code(" ".join(rest))] * bool(rest)])
 
 
 def _listed(texts: Iterable[str]) -> str:
