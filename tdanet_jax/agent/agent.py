@@ -136,8 +136,9 @@ class Agent(BaseAgent):
         Raises:
           LabelError: a label means nothing known, and has a word without a word vector.
           ValueError: the model needs an image instead of detections; it has sensors and is not
-            told whether its MoveAhead was blocked; every action is forbidden, or what is none; or a
-            pose is given where none is expected, is missing, or is not from `measured_pose`.
+            told whether its MoveAhead was blocked; every action is forbidden, or one that does
+            not exist; or a pose is given where none is expected, is missing, or is not from
+            `measured_pose`.
         """
         self._checked(state, blocked, pose, forbidden)
         obs, owner = self._observe(detections, target)

@@ -67,7 +67,7 @@ class BaseAgent:
     ) -> None:
         self.grid: PoseGrid = spec.grid
         self.spec = spec
-        self._own = vectors  # of which its classes keep their vectors, whatever words are added
+        self._own = vectors  # adding words does not change the vectors of the trained classes
         self._described = vectors.described(classes)
         self._synonyms = synonyms
         self._names = tuple(classes)
