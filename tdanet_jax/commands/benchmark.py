@@ -34,7 +34,7 @@ from tdanet_jax.commands.console import (
     one_line_errors,
     parse,
 )
-from tdanet_jax.config import PRESETS, NetworkConfig, TrainConfig
+from tdanet_jax.config import PRESETS, TrainConfig
 from tdanet_jax.targets import naming
 
 if TYPE_CHECKING:
@@ -82,23 +82,24 @@ class Command:
     which the `agent` part acts, by default 18-4-best."""
     models: tuple[str, ...] = ("tdanet",)
     """Models of the `rollout`, `update`, `profile` and `decision` parts."""
+    preset: Literal["default", "best", "robust", "paper-inputs", "paper"] = "default"
+    """Preset whose network and update these parts measure, and that the `quality` part trains, on
+    validation, until two evaluations in a row reach the paper's figures on split 18/4."""
     odometry: bool = False
-    """Give these models odometry, as the training command does."""
+    """Add odometry to the preset, as the training command does."""
     triangulation: bool = False
-    """With --odometry, also give them triangulation."""
+    """With odometry, also add triangulation."""
+    context: int | None = None
+    """Units of the context, instead of the preset's; 0: none."""
+    units: int | None = None
+    """Units of each layer of the encoder and of the LSTM, instead of the preset's."""
     data: str | None = None
     """File of rooms that `tdanet scenes import` wrote, instead of the bundled ones."""
     devices: int = 1
     """Devices that the environments of the `environment` part are split over; a CPU is split into
     as many."""
-    preset: Literal["default", "best", "robust", "paper-inputs", "paper"] = "default"
-    """Preset that the `quality` part trains, on validation, until two evaluations in a row reach
-    the paper's figures on split 18/4."""
     num_envs: int | None = None
     """Environments of the `quality` part, instead of the preset's."""
-    units: int | None = None
-    """Units of each layer of the encoder and of the LSTM in the `quality` part, instead of the
-    preset's."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the `quality` part, one run each."""
     most_steps: int = 6_000_000
@@ -109,36 +110,41 @@ class Command:
     """File for the results, one JSON object per line, written as they come; must not exist."""
 
     def config(self, model: str, precision: Precision = "auto") -> TrainConfig:
-        """The run whose model and rooms are measured."""
-        network = NetworkConfig(
-            odometry=self.odometry, triangulation=self.triangulation, precision=precision
+        """The run whose model, update and rooms are measured."""
+        chosen = PRESETS[self.preset]
+        network = dataclasses.replace(
+            chosen.network,
+            odometry=self.odometry or chosen.network.odometry,
+            triangulation=self.triangulation or chosen.network.triangulation,
+            precision=precision,
         )
-        return TrainConfig(model=model, network=network, data=self.data)
+        if self.context is not None:
+            network = dataclasses.replace(network, context=self.context)
+        if self.units is not None:
+            network = dataclasses.replace(network, width=self.units, hidden=self.units)
+        return dataclasses.replace(chosen, model=model, network=network, data=self.data)
 
     def trained(self) -> list[TrainConfig]:
         """The runs of the `quality` part."""
-        chosen = dataclasses.replace(
-            PRESETS[self.preset], episodes=None, steps=self.most_steps, validation=True
-        )
-        learner, network = chosen.learner, chosen.network
+        chosen = self.config("tdanet")
         if self.num_envs is not None:
-            learner = dataclasses.replace(learner, num_envs=self.num_envs)
-        if self.units is not None:
-            network = dataclasses.replace(network, width=self.units, hidden=self.units)
-        chosen = dataclasses.replace(chosen, learner=learner, network=network)
-        return [dataclasses.replace(chosen, seed=seed, data=self.data) for seed in self.seeds]
+            learner = dataclasses.replace(chosen.learner, num_envs=self.num_envs)
+            chosen = dataclasses.replace(chosen, learner=learner)
+        chosen = dataclasses.replace(chosen, episodes=None, steps=self.most_steps, validation=True)
+        return [dataclasses.replace(chosen, seed=seed) for seed in self.seeds]
 
     def check_parts(self) -> None:
         """Raises ValueError if a flag is given that none of the `parts` heeds."""
         timed = ("machine", "environment", *TRAINED, "evaluation", "decision")
-        quality = ("preset", "num_envs", "units", "seeds", "most_steps")
+        networks = ("preset", "odometry", "triangulation", "context", "units")
         for names, parts in (
-            (("odometry", "triangulation", "models"), (*TRAINED, "decision")),
+            (("models",), (*TRAINED, "decision")),
+            (networks, (*TRAINED, "decision", "quality")),
             (("batches", "precisions"), TRAINED),
             (("environments", "devices"), ("environment",)),
             (("networks",), ("evaluation",)),
             (("checkpoint",), ("evaluation", "agent")),
-            (quality, ("quality",)),
+            (("num_envs", "seeds", "most_steps"), ("quality",)),
             (("repeats",), timed),
             (("data",), ("import", *timed[1:], "quality")),
         ):
@@ -168,10 +174,8 @@ def main(arguments: list[str] | None = None) -> None:
         with contextlib.ExitStack() as named:
             for ours, instead_of in OWN_NAMES:
                 named.enter_context(naming(ours, instead_of))
-            for config in command.trained():
+            for config in (*map(command.config, command.models), *command.trained()):
                 config.check()
-        for name in command.models:
-            command.config(name).check()
         command.check_parts()
         if command.checkpoint is not None:
             from tdanet_jax.evaluation import saved_networks
@@ -244,10 +248,12 @@ def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
             yield benchmarking.evaluation_row(
                 command.checkpoint, task, networks, command.repeats, command.data
             )
-    sensors = {"odometry": command.odometry, "triangulation": command.triangulation}
     for name in command.models:
+        network = command.config(name).network
+        settings = {"preset": command.preset, "units": network.width, "context": network.context}
+        settings |= {"odometry": network.odometry, "triangulation": network.triangulation}
         for row in model_rows(command, name, peak):
-            yield {"part": row.pop("part"), "model": name, **sensors, **row}
+            yield {"part": row.pop("part"), "model": name, **settings, **row}
     if "agent" in command.parts:
         yield benchmarking.agent_row(command.checkpoint or BUNDLED)
     if "quality" in command.parts:
@@ -269,6 +275,7 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
     from tdanet_jax.tools import benchmarking
 
     repeats, measured = command.repeats, set()
+    update = command.config(name).learner
     operations = 0
     if "update" in command.parts:
         operations = benchmarking.operations_per_step(load_task(command.config(name, "float32")))
@@ -279,16 +286,17 @@ def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]
             continue
         measured.add(precision)
         for count in command.batches:
+            learner = dataclasses.replace(update, num_envs=count)
             if "rollout" in command.parts:
-                yield benchmarking.rollout_row(task, count, repeats) | {"precision": precision}
+                yield benchmarking.rollout_row(task, learner, repeats) | {"precision": precision}
             if "update" in command.parts:
-                row = benchmarking.update_row(task, count, repeats)
+                row = benchmarking.update_row(task, learner, repeats)
                 share = benchmarking.share_of_peak(operations, row, peak)
                 yield {**row, **share, "precision": precision}
             if "profile" in command.parts:
                 from tdanet_jax.tools import profiling
 
-                yield profiling.profile_row(task, count) | {"precision": precision}
+                yield profiling.profile_row(task, learner) | {"precision": precision}
     if "decision" in command.parts:
         task = load_task(command.config(name))
         for count in (1, 1024):
@@ -388,8 +396,8 @@ def as_table(rows: list[Row]) -> Table:
     """All rows as one table: the part, its setting, and its results."""
     table = Table("part", "setting", "results")
     settings = (
-        "environments", "devices", "observations", "precision", "model", "odometry",
-        "triangulation", "batch", "networks", "preset", "seed",
+        "environments", "devices", "observations", "precision", "model", "preset", "units",
+        "context", "odometry", "triangulation", "batch", "networks", "seed",
     )  # fmt: skip
     for row in rows:
         setting = ", ".join(f"{k} {row[k]}" for k in settings if k in row)

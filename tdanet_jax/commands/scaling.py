@@ -110,23 +110,28 @@ def _measured(command: Command, task: Task) -> Iterator[Row]:
     from tdanet_jax.config import LearnerConfig
     from tdanet_jax.tools.benchmarking import update_cost
 
-    count = LearnerConfig().num_envs
     model, words, params = task.model, task.train_words, task.train_params
+    default = LearnerConfig()
 
-    def row(size: str, value: int, words: jax.Array, params: EnvParams, count: int) -> Row:
-        return {"size": size, "value": value} | update_cost(
-            model, words, params, count, command.repeats
-        )
+    def row(
+        size: str,
+        value: int,
+        words: jax.Array = words,
+        params: EnvParams = params,
+        config: LearnerConfig = default,
+    ) -> Row:
+        cost = update_cost(model, words, params, config, command.repeats)
+        return {"size": size, "value": value} | cost
 
     for value in command.environments:
-        yield row("environments", value, words, params, value)
+        yield row("environments", value, config=LearnerConfig(num_envs=value))
     for value in command.rooms:
-        yield row("rooms", value, words, with_rooms(task, value), count)
+        yield row("rooms", value, params=with_rooms(task, value))
     for value in command.classes:
         padded = jnp.pad(words, ((0, value - len(words)), (0, 0)))
-        yield row("classes", value, padded, params, count)
+        yield row("classes", value, words=padded)
     for value in command.detections:
-        yield row("detections", value, words, with_detections(params, value), count)
+        yield row("detections", value, params=with_detections(params, value))
 
 
 def with_rooms(task: Task, count: int) -> EnvParams:

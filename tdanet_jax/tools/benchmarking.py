@@ -133,9 +133,9 @@ def environment_row(task: Task, count: int, observed: bool, repeats: int, mesh: 
     }
 
 
-def rollout_row(task: Task, count: int, repeats: int) -> Row:
+def rollout_row(task: Task, config: LearnerConfig, repeats: int) -> Row:
     """Acting alone: environment, network, and what the gradient will need."""
-    model, config = task.model, LearnerConfig(num_envs=count)
+    model = task.model
     state = learner.init(jax.random.key(0), config, model, task.train_words, task.train_params)
 
     @jax.jit
@@ -148,15 +148,15 @@ def rollout_row(task: Task, count: int, repeats: int) -> Row:
     first, seconds = timed(call, repeats, inner=5)
     return {
         "part": "rollout",
-        "environments": count,
+        "environments": config.num_envs,
         "compile_seconds": round(first - seconds, 2),
-        "steps_per_second": round(count * config.rollout_steps / seconds),
+        "steps_per_second": round(config.num_envs * config.rollout_steps / seconds),
     }
 
 
-def update_row(task: Task, count: int, repeats: int) -> Row:
+def update_row(task: Task, config: LearnerConfig, repeats: int) -> Row:
     """Rollout, gradient and optimiser step, as in training."""
-    cost = update_cost(task.model, task.train_words, task.train_params, count, repeats)
+    cost = update_cost(task.model, task.train_words, task.train_params, config, repeats)
     return {"part": "update", **cost}
 
 
@@ -186,15 +186,15 @@ def share_of_peak(operations: int, update: Row, peak: float | None) -> Row:
 
 
 def update_cost(
-    model: ActorCritic, words: jax.Array, params: EnvParams, count: int, repeats: int
+    model: ActorCritic, words: jax.Array, params: EnvParams, config: LearnerConfig, repeats: int
 ) -> Row:
-    """Time and memory of an update of `count` environments, and XLA's count of its operations.
+    """Time and memory of an update, and XLA's count of its operations.
 
     XLA counts the body of a loop once, and an update loops over its T steps. Its count divided by
     the number of environments is thus that of one environment step, plus what is done once per
     update.
     """
-    config, updates = LearnerConfig(num_envs=count), 5
+    count, updates = config.num_envs, 5
     chunk = learner.make_train(config, model, updates)
     state = learner.init(jax.random.key(0), config, model, words, params)
     share = jnp.zeros(2)

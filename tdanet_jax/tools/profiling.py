@@ -39,7 +39,7 @@ _INSTRUCTION = re.compile(r"^\s*(?:ROOT )?%?([\w.-]+) = (.*)$", re.MULTILINE)
 _PLACE = re.compile(r'op_name="([^"]*)"')
 
 
-def profile_row(task: Task, count: int) -> Row:
+def profile_row(task: Task, config: LearnerConfig) -> Row:
     """Shares of the parts of an update in the time of all its operations.
 
     Operations that run side by side count each in full. The profiler itself slows an update down by
@@ -47,9 +47,8 @@ def profile_row(task: Task, count: int) -> Row:
 
     Args:
       task: whose model is trained.
-      count: environments.
+      config: the update.
     """
-    config = LearnerConfig(num_envs=count)
     chunk = learner.make_train(config, task.model, UPDATES)
     arguments = jnp.zeros(2), task.train_words, task.train_params
     key = jax.random.key(0)
@@ -71,7 +70,7 @@ def profile_row(task: Task, count: int) -> Row:
     shares: dict[str, Any] = {part: round(spent[part] / total, 3) for part in PARTS}
     return {
         "part": "profile",
-        "environments": count,
+        "environments": config.num_envs,
         "milliseconds_per_update": round(1e3 * seconds / UPDATES, 1),
         **shares,
     }

@@ -1,10 +1,12 @@
 """The benchmark command: its figures' names, and wrong arguments."""
 
+import dataclasses
 import json
 
 import pytest
 
 from tdanet_jax.commands import benchmark
+from tdanet_jax.config import PAPER_INPUTS
 from tdanet_jax.tools import benchmarking
 from tests.agent.test_agent import OLD_RUN
 
@@ -67,6 +69,30 @@ def test_decisions_of_any_model_are_timed(model, flags, ithor, tmp_path):
     assert {row["triangulation"] for row in rows} == {"--triangulation" in flags}
     least = {"ssnet": 2e6, "tdanet": 1e6}[model]
     assert all(row["milliseconds"] > 0 and row["parameters"] > least for row in rows)
+
+
+def test_a_presets_network_and_update_are_measured():
+    chosen = benchmark.Command(preset="paper-inputs").config("tdanet", "float32")
+    assert chosen.learner == PAPER_INPUTS.learner
+    assert chosen.network == dataclasses.replace(PAPER_INPUTS.network, precision="float32")
+    changed = benchmark.Command(preset="paper-inputs", context=0, units=8, odometry=True)
+    expected = dataclasses.replace(
+        PAPER_INPUTS.network, context=0, width=8, hidden=8, odometry=True
+    )
+    assert changed.config("tdanet").network == expected
+    best = benchmark.Command(preset="best")
+    assert best.config("tdanet").network.triangulation
+    assert {run.network for run in best.trained()} == {best.config("tdanet").network}
+
+
+@pytest.mark.slow
+def test_an_update_of_a_preset_is_timed(ithor, tmp_path):
+    out = tmp_path / "figures.jsonl"
+    flags = ["--parts", "update", "--batches", "2", "--precisions", "float32", "--repeats", "1"]
+    benchmark.main([*flags, "--preset", "paper-inputs", "--units", "8", "--out", str(out)])
+    row = json.loads(out.read_text().splitlines()[-1])
+    assert (row["preset"], row["units"], row["context"]) == ("paper-inputs", 8, 64)
+    assert row["steps_per_second"] > 0
 
 
 def test_a_model_that_cannot_triangulate_is_one_line(ithor, tmp_path, capsys):

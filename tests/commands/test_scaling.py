@@ -31,8 +31,12 @@ def test_the_sizes_that_are_measured_by_default_are_possible(ithor, glove):
 
 @pytest.mark.slow
 def test_it_writes_figures_and_a_plot(tmp_path, monkeypatch, ithor):
-    def cost(model, words, params, count, repeats):
-        return {"steps_per_second": count, "temporary_mb": len(words), "arguments_mb": 1.0}
+    def cost(model, words, params, config, repeats):
+        return {
+            "steps_per_second": config.num_envs,
+            "temporary_mb": len(words),
+            "arguments_mb": 1.0,
+        }
 
     monkeypatch.setattr(benchmarking, "update_cost", cost)
     sizes = ["--environments", "8", "16", "--rooms", "3", "--classes", "118", "--detections", "80"]

@@ -54,7 +54,7 @@ def test_loops_and_other_programs_are_left_out():
 
 @pytest.mark.slow
 def test_an_update_has_all_parts(some_rooms, glove):
-    row = profiling.profile_row(make_task(TINY, some_rooms, glove), 4)
+    row = profiling.profile_row(make_task(TINY, some_rooms, glove), TINY.learner)
     assert sum(row[part] for part in profiling.PARTS) == pytest.approx(1, abs=0.01)
     for part in ("products", "optimizer", "random_numbers", "environment", "lstm_gates"):
         assert row[part] > 0
