@@ -166,7 +166,8 @@ def test_means_on_split_14_8_with_the_papers_inputs() -> None:
         return out
 
     readme = " ".join((ROOT / "README.md").read_text().split())
-    assert f"reaches {' and '.join(means('L>=1', '{:.1f} / {:.1f}'))} there (three" in readme
+    told = " and ".join(means("L>=1", "{:.1f} / {:.1f}"))
+    assert f"reaches {told} there (three seeds)" in readme
     told = " ".join(section("results", "Zero-shot split 14/8").split())
     seen, unseen = means("L>=5", "{0:.1f} ± {2:.1f}, SPL {1:.1f} ± {3:.1f}")
     assert f"L >= 5, with context: seen SR {seen}; unseen SR {unseen}." in told
