@@ -8,6 +8,7 @@ import re
 import statistics
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -116,85 +117,74 @@ def test_figures_of_the_bundled_agent() -> None:
     told = " ".join(section("results", "The bundled agents").split())
     pairs = [found[group]["L>=1"] for group in ("seen", "unseen")]
     assert " and ".join(f"{pair['SR']:.1f} / {pair['SPL']:.1f}" for pair in pairs) in told
-
-
-@pytest.mark.parametrize("split", ["18-4", "14-8"])
-def test_the_readme_gives_the_means_of_three_seeds(split: str) -> None:
-    paths = ROOT.glob(f"results/{split}-best-half-[012]/results.json")
-    found = [json.loads(path.read_text()) for path in paths]
-    assert len(found) == 3
+    seen, unseen = (f"{pair['SR']:.1f} / {pair['SPL']:.1f}" for pair in pairs)
     readme = " ".join((ROOT / "README.md").read_text().split())
+    assert f"`18-4-best` has {seen} seen and {unseen} unseen" in readme
+
+
+def three_seeds(row: str) -> list[dict[str, Any]]:
+    """The results of three seeds of an agent, rows of the scoreboard."""
+    paths = [ROOT / f"results/{row}-{seed}/results.json" for seed in range(3)]
+    return [json.loads(path.read_text()) for path in paths]
+
+
+def means(found: list[dict[str, Any]], bucket: str, form: str) -> tuple[str, ...]:
+    """Seen SR and SPL, and unseen ones.
+
+    Args:
+      found: the results of each seed.
+      bucket: of shortest paths: "L>=1".
+      form: of a mean, {0}, and a standard deviation, {1}.
+    """
+    out = []
     for group in ("seen", "unseen"):
-        sr, spl = (statistics.fmean(r[group]["L>=1"][m] for r in found) for m in ("SR", "SPL"))
-        assert f"{sr:.1f} / {spl:.1f} {group}" in readme
+        for measure in ("SR", "SPL"):
+            values = [results[group][bucket][measure] for results in found]
+            out.append(form.format(statistics.fmean(values), statistics.stdev(values)))
+    return tuple(out)
 
 
-def test_means_of_the_seeds_with_the_papers_inputs() -> None:
-    paths = ROOT.glob("results/18-4-paper-inputs-context-[012]/results.json")
-    found = [json.loads(path.read_text()) for path in paths]
-    assert len(found) == 3
-
-    def of_seeds(bucket: str, spread: bool) -> list[str]:
-        each = [
-            [results[group][bucket][measure] for results in found]
-            for group in ("seen", "unseen")
-            for measure in ("SR", "SPL")
-        ]
-        means = [f"{statistics.fmean(values):.1f}" for values in each]
-        if not spread:
-            return means
-        return [f"{m} ± {statistics.stdev(v):.1f}" for m, v in zip(means, each, strict=True)]
-
-    readme = (ROOT / "README.md").read_text()
-    assert f"paper-inputs`, three seeds | {' | '.join(of_seeds('L>=1', spread=False))} |" in readme
-    told = " ".join(section("results", "The paper's inputs").split())
-    sr, spl, unseen_sr, unseen_spl = of_seeds("L>=5", spread=True)
-    assert f"L >= 5: seen SR {sr}, SPL {spl}; unseen SR {unseen_sr}, SPL {unseen_spl}." in told
-
-
-def test_means_on_split_14_8_with_the_papers_inputs() -> None:
-    paths = ROOT.glob("results/14-8-paper-inputs-context-[012]/results.json")
-    found = [json.loads(path.read_text()) for path in paths]
-    assert len(found) == 3
-
-    def means(bucket: str, form: str) -> list[str]:
-        out = []
-        for group in ("seen", "unseen"):
-            sr, spl = ([r[group][bucket][m] for r in found] for m in ("SR", "SPL"))
-            values = *map(statistics.fmean, (sr, spl)), *map(statistics.stdev, (sr, spl))
-            out.append(form.format(*values))
-        return out
-
+@pytest.mark.parametrize(
+    ("row", "sentence"),
+    [
+        ("18-4-paper-inputs-context", "`--preset paper-inputs` | {} | {} | {} | {} |"),
+        ("18-4-best", "`--preset best` | {} | {} | {} | {} |"),
+        ("18-4-best-half", "reach {} / {} seen and {} / {} unseen, and on split 14/8"),
+        ("14-8-best-half", "eight unseen classes, {} / {} seen and {} / {} unseen"),
+        ("14-8-paper-inputs-context", "reaches {} / {} and {} / {} there (three seeds)"),
+    ],
+)
+def test_the_readme_gives_the_means_of_three_seeds(row: str, sentence: str) -> None:
     readme = " ".join((ROOT / "README.md").read_text().split())
-    told = " and ".join(means("L>=1", "{:.1f} / {:.1f}"))
-    assert f"reaches {told} there (three seeds)" in readme
-    told = " ".join(section("results", "Zero-shot split 14/8").split())
-    seen, unseen = means("L>=5", "{0:.1f} ± {2:.1f}, SPL {1:.1f} ± {3:.1f}")
-    assert f"L >= 5, with context: seen SR {seen}; unseen SR {unseen}." in told
+    assert sentence.format(*means(three_seeds(row), "L>=1", "{0:.1f}")) in readme
 
 
-def test_means_of_the_seeds_on_split_14_8() -> None:
-    paths = ROOT.glob("results/14-8-best-half-[012]/results.json")
-    found = [json.loads(path.read_text()) for path in paths]
-    assert len(found) == 3
+@pytest.mark.parametrize(
+    ("row", "heading", "opening"),
+    [
+        ("18-4-paper-inputs-context", "The paper's inputs", "L >= 5"),
+        ("18-4-best", "Half the width", "L >= 5, the preset as it is"),
+        ("14-8-best-half", "Zero-shot split 14/8", "L >= 5"),
+        ("14-8-paper-inputs-context", "Zero-shot split 14/8", "L >= 5, with context"),
+    ],
+)
+def test_means_of_three_seeds_on_longer_paths(row: str, heading: str, opening: str) -> None:
+    told = " ".join(section("results", heading).split())
+    figures = means(three_seeds(row), "L>=5", "{0:.1f} ± {1:.1f}")
+    sentence = "{}: seen SR {}, SPL {}; unseen SR {}, SPL {}."
+    assert sentence.format(opening, *figures) in told
 
-    def of_seeds(group: str, bucket: str, measure: str) -> list[float]:
-        return [results[group][bucket][measure] for results in found]
 
-    told = " ".join(section("results", "Zero-shot split 14/8").split())
-    for group in ("seen", "unseen"):
-        sr, spl = (of_seeds(group, "L>=5", m) for m in ("SR", "SPL"))
-        for measure, values in {f"{group} SR": sr, "SPL": spl}.items():
-            mean, deviation = statistics.fmean(values), statistics.stdev(values)
-            assert f"{measure} {mean:.1f} ± {deviation:.1f}" in told
-    heads, means = (
+def test_rates_of_the_unseen_classes_of_split_14_8() -> None:
+    found = three_seeds("14-8-best-half")
+    heads, rates = (
         cells[1:]
         for cells in rows(section("results", "Zero-shot split 14/8"))
         if cells[0] in ("", "these")
     )
-    for name, mean in zip(heads, means, strict=True):
-        rates = [results["by_target"][name]["unseen"]["L>=1"]["SR"] for results in found]
-        assert mean == f"{statistics.fmean(rates):.1f}"
+    for name, rate in zip(heads, rates, strict=True):
+        each = [results["by_target"][name]["unseen"]["L>=1"]["SR"] for results in found]
+        assert rate == f"{statistics.fmean(each):.1f}"
 
 
 def test_figures_of_the_agent_of_the_open_benchmark() -> None:
