@@ -133,6 +133,18 @@ class Command:
         chosen = dataclasses.replace(chosen, episodes=None, steps=self.most_steps, validation=True)
         return [dataclasses.replace(chosen, seed=seed) for seed in self.seeds]
 
+    def settings(self, config: TrainConfig) -> Row:
+        """What the rows of a run say of its model."""
+        network = config.network
+        return {
+            "model": config.model,
+            "preset": self.preset,
+            "units": network.width,
+            "context": network.context,
+            "odometry": network.odometry,
+            "triangulation": network.triangulation,
+        }
+
     def check_parts(self) -> None:
         """Raises ValueError if a flag is given that none of the `parts` heeds."""
         timed = ("machine", "environment", *TRAINED, "evaluation", "decision")
@@ -249,18 +261,18 @@ def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
                 command.checkpoint, task, networks, command.repeats, command.data
             )
     for name in command.models:
-        network = command.config(name).network
-        settings = {"preset": command.preset, "units": network.width, "context": network.context}
-        settings |= {"odometry": network.odometry, "triangulation": network.triangulation}
+        settings = command.settings(command.config(name))
         for row in model_rows(command, name, peak):
-            yield {"part": row.pop("part"), "model": name, **settings, **row}
+            yield {"part": row.pop("part"), **settings, **row}
     if "agent" in command.parts:
         yield benchmarking.agent_row(command.checkpoint or BUNDLED)
     if "quality" in command.parts:
         from tdanet_jax.tools import quality
 
         for config in command.trained():
-            yield {"preset": command.preset, **quality.quality_row(config)}
+            row = quality.quality_row(config)
+            settings = {**command.settings(config), "environments": config.learner.num_envs}
+            yield {"part": row.pop("part"), **settings, **row}
 
 
 def model_rows(command: Command, name: str, peak: float | None) -> Iterator[Row]:

@@ -7,7 +7,7 @@ import pytest
 
 from tdanet_jax.commands import benchmark
 from tdanet_jax.config import PAPER_INPUTS
-from tdanet_jax.tools import benchmarking
+from tdanet_jax.tools import benchmarking, quality
 from tests.agent.test_agent import OLD_RUN
 
 
@@ -83,6 +83,17 @@ def test_a_presets_network_and_update_are_measured():
     best = benchmark.Command(preset="best")
     assert best.config("tdanet").network.triangulation
     assert {run.network for run in best.trained()} == {best.config("tdanet").network}
+
+
+def test_rows_of_quality_say_what_was_trained(ithor, tmp_path, monkeypatch):
+    monkeypatch.setattr(quality, "quality_row", lambda config: {"part": "quality", "seed": 3})
+    out = tmp_path / "figures.jsonl"
+    flags = ["--preset", "paper-inputs", "--context", "8", "--num-envs", "2", "--odometry"]
+    benchmark.main(["--parts", "quality", "--seeds", "3", *flags, "--out", str(out)])
+    assert json.loads(out.read_text().splitlines()[-1]) == {
+        "part": "quality", "seed": 3, "model": "tdanet", "preset": "paper-inputs", "units": 256,
+        "context": 8, "odometry": True, "triangulation": False, "environments": 2,
+    }  # fmt: skip
 
 
 @pytest.mark.slow
