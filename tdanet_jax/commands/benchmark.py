@@ -233,6 +233,7 @@ def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
     """
     import jax
 
+    from tdanet_jax.models.factory import unused_flags
     from tdanet_jax.task import load_task
     from tdanet_jax.tools import benchmarking
     from tdanet_jax.training import devices
@@ -261,7 +262,10 @@ def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
                 command.checkpoint, task, networks, command.repeats, command.data
             )
     for name in command.models:
-        settings = command.settings(command.config(name))
+        config = command.config(name)
+        settings = command.settings(config)
+        if "--context" in unused_flags(config, task.classes):
+            del settings["context"]
         for row in model_rows(command, name, peak):
             yield {"part": row.pop("part"), **settings, **row}
     if "agent" in command.parts:

@@ -256,6 +256,7 @@ def test_agrees_with_the_slow_world_on_random_tables(tables: SceneTables, seed: 
 @given(random_tables(), st.integers(0, 1000))
 def test_agrees_with_the_slow_world_on_many_random_tables(tables: SceneTables, seed: int) -> None:
     check_random_tables(tables, seed)
+    jax.clear_caches()  # hundreds of compiled programs would exhaust a process's memory maps
 
 
 def check_observations(tables: SceneTables, rows: Any, states: np.ndarray) -> None:
