@@ -23,7 +23,7 @@ from tdanet_jax.models.actor_critic import SENSOR_UNITS
 from tdanet_jax.models.tdanet import TARGET_BOX
 from tdanet_jax.sensors.numpy_sensors import WIDTHS
 
-#: What `tdanet_jax.robot` imports: the modules that are copied, which need NumPy alone.
+#: What `robot` imports: the modules that are copied, which need NumPy alone.
 MODULES = (
     "agent/__init__", "agent/base", "agent/camera", "agent/detection", "agent/detectors",
     "agent/navigator", "agent/numpy_agent", "decisions", "io/__init__", "io/archive", "io/assets",
@@ -40,8 +40,8 @@ def export(run: Path | str, folder: Path | str, word_vectors: Path | str | None 
     """Writes an agent's folder for robots without JAX.
 
     It holds the network's parameters (`model.npz`), the word vectors (`words.npz`), what the agent
-    is shown (`meta.json`), and `tdanet_jax`: the part of this package that a robot needs
-    (`tdanet_jax.robot`), which needs NumPy alone.
+    is shown (`meta.json`), and `tdanet_jax`: the part of this package that a robot needs, which
+    needs NumPy alone.
 
     Args:
       run: as `tdanet_jax.load` takes it.

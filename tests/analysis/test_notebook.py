@@ -13,8 +13,8 @@ NOTEBOOK = Path(__file__).parents[2] / "notebooks" / "analysis.ipynb"
 
 @pytest.mark.slow
 def test_it_runs(opinionated_run, tmp_path):
-    import nbclient  # both come with the extra `analysis`
-    import nbformat
+    nbclient = pytest.importorskip("nbclient", reason="needs the extra `analysis`")
+    nbformat = pytest.importorskip("nbformat", reason="needs the extra `analysis`")
 
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     first = next(cell for cell in notebook.cells if cell.cell_type == "code")

@@ -204,7 +204,7 @@ def test_updates_make_the_estimate_better() -> None:
     _, params = house.TASKS[True]
     state = house.begin(jax.random.key(0), house.CONFIG, MODEL, house.WORDS, params)
     losses = []
-    for _ in range(60):
+    for _ in range(120):
         state, metrics = house.update(
             state, jnp.float32(0), house.CONFIG, MODEL, house.WORDS, params
         )
