@@ -517,7 +517,7 @@ ROBUST = dataclasses.replace(
 PAPER_INPUTS = TrainConfig(
     extra_targets="all",
     learner=LearnerConfig(gamma=0.97, imitation_weight=0.3),
-    network=NetworkConfig(width=256, hidden=256, context=64, temperature=0.7),
+    network=NetworkConfig(context=64, temperature=0.7),
 )
 PRESETS = {
     "default": TrainConfig(),

@@ -128,9 +128,7 @@ def test_the_preset_with_the_inputs_of_the_paper_has_no_others():
         default,
         extra_targets="all",
         learner=dataclasses.replace(default.learner, gamma=0.97, imitation_weight=0.3),
-        network=dataclasses.replace(
-            default.network, width=256, hidden=256, context=64, temperature=0.7
-        ),
+        network=dataclasses.replace(default.network, context=64, temperature=0.7),
     )
     assert ours.network.spec.sensors == ()
     ours.check()

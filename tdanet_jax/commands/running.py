@@ -38,8 +38,8 @@ class Command:
     --temperature 0.3, --done-bias 2, --gamma 0.97, --size-noise 0.5, --imitation-weight 0.3 and
     --extra-targets all, which did best on validation. robust, for robots, whose senses err:
     --odometry, --triangulation, --robust-triangulation, --scores, --gamma 0.97, --size-noise 0.5
-    and --noise. paper-inputs: for the inputs that the paper's agent has, --width 256, --hidden 256,
-    --context 64, --temperature 0.7, --gamma 0.97, --imitation-weight 0.3 and --extra-targets all.
+    and --noise. paper-inputs: for the inputs that the paper's agent has, --context 64,
+    --temperature 0.7, --gamma 0.97, --imitation-weight 0.3 and --extra-targets all.
     paper: the reference implementation's hyperparameters and its budget of 6 M episodes."""
     out: Path | None = None
     """Folder for everything that the run writes; must be new or empty."""

@@ -91,7 +91,7 @@ def test_rows_of_quality_say_what_was_trained(ithor, tmp_path, monkeypatch):
     flags = ["--preset", "paper-inputs", "--context", "8", "--num-envs", "2", "--odometry"]
     benchmark.main(["--parts", "quality", "--seeds", "3", *flags, "--out", str(out)])
     assert json.loads(out.read_text().splitlines()[-1]) == {
-        "part": "quality", "seed": 3, "model": "tdanet", "preset": "paper-inputs", "units": 256,
+        "part": "quality", "seed": 3, "model": "tdanet", "preset": "paper-inputs", "units": 512,
         "context": 8, "odometry": True, "triangulation": False, "environments": 2,
     }  # fmt: skip
 
