@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import textwrap
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ from tdanet_jax.splits import GROUPS
 DPI = 130
 #: Points of a learning curve, at most: enough to see its shape, too few to see its noise.
 PARTS = 60
+#: Along and up.
+_Line = tuple[list[float], list[float]]
 #: Line style, colour and label of what training keeps in memory.
 _MEMORY = {
     "temporary_mb": ("s-", ORANGE, "rollout and activation cache"),
@@ -73,42 +75,67 @@ def training_curves(
 ) -> None:
     """SR and SPL in the training rooms against environment steps, a line for each agent.
 
-    Lines are means over an agent's runs and over steps, in `PARTS` parts of the logarithmic axis.
+    Agents that were trained for as many steps share a row of panels, those with the highest SR
+    named first. Lines are means over an agent's runs and over steps, in `PARTS` parts of the
+    logarithmic axis.
 
     Args:
       runs: a label and the rows of `metrics.jsonl` of each; runs of one label are one agent.
-      title: above both panels.
+      title: above all panels.
       path: the picture's file.
       comment: unseen, in the file; it must be a PNG then.
     """
-    labels = [*dict.fromkeys(label for label, _ in runs)]
-    listed = {label: textwrap.fill(in_figure(label), 120) for label in labels}
-    text_lines = sum(text.count("\n") + 1 for text in listed.values())
-    figure = Figure(figsize=(9, 3.8 + 0.19 * text_lines), layout="constrained")
-    axes = figure.subplots(1, 2)
-    styles = [(color, dashes) for dashes in ("-", "--", ":", "-.") for color in PALETTE]
-    rows = {label: [row for name, own in runs if name == label for row in own] for label in labels}
-    every = [row["steps"] / 1e6 for own in rows.values() for row in own]
+    agents: dict[str, list[dict[str, Any]]] = {}
+    for label, own in runs:
+        agents.setdefault(label, []).extend(own)
+    every = [row["steps"] / 1e6 for own in agents.values() for row in own]
     edges = np.geomspace(min(every), max(every), PARTS + 1)
-    for axis, measure, name in zip(axes, MEASURES, ("success", "spl"), strict=True):
-        for index, own in enumerate(rows.values()):
-            steps = np.array([row["steps"] / 1e6 for row in own])
-            rates = 100 * np.array([row[name] for row in own], float)  # None becomes NaN
-            known = ~np.isnan(rates)
-            part = np.searchsorted(edges[1:-1], steps, side="right")
-            parts = [known & (part == i) for i in np.unique(part[known])]
-            color, dashes = styles[index % len(styles)]
-            x, y = ([values[one].mean() for one in parts] for values in (steps, rates))
-            axis.plot(x, y, dashes, color=color, linewidth=1.2)
-        axis.set(xlabel="million environment steps", ylim=(0, 100), xscale="log")
-        axis.xaxis.set_major_formatter("{x:g}")
-        axis.set(ylabel=f"{measure}, per cent, training rooms")
-        axis.grid(alpha=0.3)
-        axis.spines[["top", "right"]].set_visible(False)
+    budgets: dict[float, list[tuple[float, str, list[_Line]]]] = {}
+    for label, own in agents.items():
+        lines = [_by_part(own, name, edges) for name in ("success", "spl")]
+        last = lines[0][1][-1] if lines[0][1] else 0.0
+        millions = float(f"{max(row['steps'] for row in own) / 1e6:.2g}")
+        listed = textwrap.fill(in_figure(label), 64)
+        budgets.setdefault(millions, []).append((last, listed, lines))
+    heights = [
+        max(2.6, 0.9 + 0.16 * sum(listed.count("\n") + 1 for _, listed, _ in budgets[millions]))
+        for millions in sorted(budgets)
+    ]
+    figure = Figure(figsize=(14, 0.5 + sum(heights)), layout="constrained")
+    panels = figure.subplots(len(budgets), 3, height_ratios=heights, squeeze=False)
+    for (*axes, beside), millions in zip(panels, sorted(budgets), strict=True):
+        members = sorted(budgets[millions], key=lambda member: -member[0])
+        for index, (axis, measure) in enumerate(zip(axes, MEASURES, strict=True)):
+            for (*_, lines), (color, dashes) in zip(members, _line_styles(), strict=False):
+                axis.plot(*lines[index], dashes, color=color, linewidth=1.2)
+            axis.set(xscale="log", xlim=(0.9 * edges[0], 1.1 * edges[-1]), ylim=(0, 100))
+            axis.set(xlabel="million environment steps", ylabel=f"{measure}, per cent")
+            axis.xaxis.set_major_formatter("{x:g}")
+            axis.grid(alpha=0.3)
+            axis.spines[["top", "right"]].set_visible(False)
+        axes[0].set_title(f"{millions:g} M steps", loc="left", fontsize=10)
+        names = [listed for _, listed, _ in members]
+        beside.set_axis_off()
+        beside.legend(axes[0].lines, names, loc="center left", fontsize=8, frameon=False)
     figure.suptitle(_in_lines(title))
-    names = [listed[label] for label in rows]
-    figure.legend(axes[0].lines, names, loc="outside lower left", fontsize=8, frameon=False)
     drawing.save(figure, path, DPI, comment)
+
+
+def _line_styles() -> Iterator[tuple[str, str]]:
+    """Colours and dashes that tell lines apart, again and again."""
+    return itertools.cycle(
+        [(color, dashes) for dashes in ("-", "--", ":", "-.") for color in PALETTE]
+    )
+
+
+def _by_part(rows: Sequence[dict[str, Any]], name: str, edges: np.ndarray) -> _Line:
+    """Million steps, and a column of `metrics.jsonl` in percent, as means between edges."""
+    steps = np.array([row["steps"] / 1e6 for row in rows])
+    rates = 100 * np.array([row[name] for row in rows], float)  # None becomes NaN
+    known = ~np.isnan(rates)
+    part = np.searchsorted(edges[1:-1], steps, side="right")
+    parts = [known & (part == i) for i in np.unique(part[known])]
+    return [steps[one].mean() for one in parts], [rates[one].mean() for one in parts]
 
 
 def data_curve(

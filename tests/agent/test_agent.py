@@ -510,7 +510,7 @@ def test_what_is_forbidden_is_never_done(agent):
         agent.act(agent.start(), seen, "mug", forbidden=Action)
 
 
-@pytest.mark.parametrize("forbidden", [["LookUp"], [7], [-1], [[0]]])
+@pytest.mark.parametrize("forbidden", [["LookUp"], [7], [-1], [[0]], [True]])
 def test_what_is_no_action_cannot_be_forbidden(agent, forbidden):
     with pytest.raises(ValueError, match=r"^forbidden .*: must be an Action, 0 to 5$"):
         agent.act(agent.start(), [], "mug", forbidden=forbidden)

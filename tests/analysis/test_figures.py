@@ -35,12 +35,11 @@ def test_training_curves_have_room_for_many_agents_and_long_names(
     figures.training_curves([(name, rows) for name in names], "Split", tmp_path / "a.png")
     [figure] = drawn
     figure.draw_without_rendering()
-    [legend] = figure.legends
-    box = legend.get_window_extent()
-    assert 0 <= box.x0 < box.x1 <= figure.bbox.width
+    left, _, beside = figure.axes
+    box = beside.get_legend().get_window_extent()
+    assert left.get_window_extent().x1 < box.x0 < box.x1 <= figure.bbox.width
     assert 0 <= box.y0 < box.y1 <= figure.bbox.height
-    heights = {axis.get_window_extent().height for axis in figure.axes}
-    assert min(heights) > 2.5 * figure.dpi
+    assert left.get_window_extent().height > 1.5 * figure.dpi
     looks = {(line.get_color(), line.get_linestyle()) for line in figure.axes[0].lines}
     assert len(looks) == len(names)
 
@@ -55,8 +54,30 @@ def test_a_training_curve_is_the_mean_over_runs_and_over_nearby_steps(
     other = [first, {"steps": 1_000_000, "success": 1.0, "spl": 1.0}]
     runs = [("a", rows), ("b", other), ("a", rows[:5000])]
     figures.training_curves(runs, "Split", tmp_path / "a.png")
-    many, few = drawn[0].axes[0].lines
+    first_row, second_row = drawn[0].axes[0], drawn[0].axes[3]
+    assert [axis.get_title(loc="left") for axis in (first_row, second_row)] == [
+        "1 M steps", "10 M steps",
+    ]  # fmt: skip
+    [few], [many] = first_row.lines, second_row.lines
     assert 30 < len(many.get_xdata()) <= figures.PARTS
     late = [y for x, y in zip(*many.get_data(), strict=True) if x > 1]
     assert late == pytest.approx([50] * len(late), abs=1)
     assert [*zip(*few.get_data(), strict=True)] == [(1.0, 100.0)]
+
+
+def test_of_agents_with_as_many_steps_the_best_is_named_first(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(drawing, "save", lambda figure, *_: drawn.append(figure))
+    rates = {"a": 0.25, "b": 0.75, "c": 0.5}
+    runs = [
+        (name, [{"steps": n, "success": rate, "spl": 0.1} for n in (10_000, 1_000_960)])
+        for name, rate in rates.items()
+    ]
+    figures.training_curves(runs, "Split", tmp_path / "a.png")
+    left, _, beside = drawn[0].axes
+    assert [text.get_text() for text in beside.get_legend().get_texts()] == ["b", "c", "a"]
+    assert [line.get_ydata()[-1] for line in left.lines] == [75, 50, 25]
+    colors = [line.get_color() for line in beside.get_legend().get_lines()]
+    assert colors == [line.get_color() for line in left.lines]
