@@ -130,7 +130,7 @@ BENCHMARKS = tuple(
     f"tdanet_jax.tools.benchmarking.{part}_row"
     for part in ("environment", "rollout", "update", "evaluation", "decision", "agent")
 )
-MODEL_TASK = SimpleNamespace(model=SimpleNamespace(dtype="float32"))
+MODEL_TASK = SimpleNamespace(model=SimpleNamespace(dtype="float32"), classes="classes")
 
 
 def row() -> dict[str, Any]:
@@ -139,6 +139,7 @@ def row() -> dict[str, Any]:
 
 def prepare_benchmark(recorder: Recorder) -> None:
     recorder.record("tdanet_jax.task.load_task", gives=MODEL_TASK)
+    recorder.record("tdanet_jax.models.factory.unused_flags", gives=list)
     recorder.record("tdanet_jax.training.devices.connect", gives=None)
     recorder.record("tdanet_jax.training.devices.check_divides", gives=None)
     recorder.record("tdanet_jax.evaluation.saved_networks.find", gives=None)
