@@ -201,8 +201,8 @@ class BaseAgent:
         if self.spec.sensors and blocked is None and action == Action.MOVE_AHEAD:
             raise ValueError("the agent has sensors: say whether its MoveAhead was `blocked`")
         for one in forbidden:
-            number = isinstance(one, int | np.integer) and not isinstance(one, bool)
-            if not number or not 0 <= one < NUM_ACTIONS:
+            is_index = isinstance(one, int | np.integer) and not isinstance(one, bool)
+            if not is_index or not 0 <= one < NUM_ACTIONS:
                 raise ValueError(f"forbidden {one!r}: must be an Action, 0 to {NUM_ACTIONS - 1}")
         if not isinstance(pose, MeasuredPose | None):
             raise ValueError("pose: must be what `measured_pose` gives")

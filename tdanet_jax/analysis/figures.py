@@ -28,7 +28,7 @@ from tdanet_jax.splits import GROUPS
 DPI = 130
 #: Points of a learning curve, at most: enough to see its shape, too few to see its noise.
 PARTS = 60
-#: Along and up.
+#: x and y of a curve: million steps, per cent.
 _Line = tuple[list[float], list[float]]
 #: Line style, colour and label of what training keeps in memory.
 _MEMORY = {
@@ -75,9 +75,9 @@ def training_curves(
 ) -> None:
     """SR and SPL in the training rooms against environment steps, a line for each agent.
 
-    Agents that were trained for as many steps share a row of panels, those with the highest SR
-    named first. Lines are means over an agent's runs and over steps, in `PARTS` parts of the
-    logarithmic axis.
+    Agents trained for the same number of steps, to two digits, share a row of panels, sorted by SR
+    at the end of training, highest first. Lines are means over an agent's runs and over steps, in
+    `PARTS` parts of the logarithmic axis.
 
     Args:
       runs: a label and the rows of `metrics.jsonl` of each; runs of one label are one agent.

@@ -261,10 +261,12 @@ def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
             yield benchmarking.evaluation_row(
                 command.checkpoint, task, networks, command.repeats, command.data
             )
-    for name in command.models:
+    for name in command.models if {*TRAINED, "decision"} & {*command.parts} else ():
         config = command.config(name)
         settings = command.settings(config)
-        if "--context" in unused_flags(config, task.classes):
+        with_context = dataclasses.replace(config.network, context=1)
+        asked = dataclasses.replace(config, network=with_context)
+        if "--context" in unused_flags(asked, task.classes):
             del settings["context"]
         for row in model_rows(command, name, peak):
             yield {"part": row.pop("part"), **settings, **row}

@@ -303,7 +303,7 @@ def agent_row(run: Path | str) -> Row:
         f"milliseconds_{ROBOTS}_robots": round(1e3 * timed(together, 20)[1], 3),
     }
     with tempfile.TemporaryDirectory() as place:
-        started = [sys.executable, "-P", "-c", FIRST_ACTION.format(run=str(run))]
+        started = [sys.executable, "-c", FIRST_ACTION.format(run=str(run))]
         compiled = os.environ | {"JAX_COMPILATION_CACHE_DIR": f"{place}/compiled"}
         compiled |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
         row["seconds_to_first_action"] = _seconds(started, compiled)
@@ -313,8 +313,10 @@ def agent_row(run: Path | str) -> Row:
             return row
         folder = export(run, Path(place) / "exported")
         row["milliseconds_without_jax"] = milliseconds(numpy_agent.load(folder))
-        started[-1] = FIRST_ACTION.format(run=str(folder)) + WITHOUT_JAX
-        alone = {**os.environ, "PYTHONPATH": str(folder)}  # its own tdanet_jax
+        code = FIRST_ACTION.format(run=str(folder)) + WITHOUT_JAX
+        alone = {**os.environ, "PYTHONPATH": str(folder)}
+        # -P: a clone in the current folder would come before the exported package.
+        started = [sys.executable, "-P", "-c", code]
         row["seconds_to_first_action_without_jax"] = _seconds(started, alone)
     return row
 
@@ -325,7 +327,7 @@ import tdanet_jax
 agent = tdanet_jax.load({run!r})
 agent.act(agent.start(), [tdanet_jax.Detection("mug", 0.2, 0.3, 0.4, 0.5)], "mug")
 """
-#: What the same program ends with where the agent must not need JAX.
+#: Appended for the exported agent: fails if anything has imported JAX.
 WITHOUT_JAX = """
 import sys
 assert "jax" not in sys.modules

@@ -65,7 +65,7 @@ def test_a_training_curve_is_the_mean_over_runs_and_over_nearby_steps(
     assert [*zip(*few.get_data(), strict=True)] == [(1.0, 100.0)]
 
 
-def test_of_agents_with_as_many_steps_the_best_is_named_first(
+def test_agents_with_the_same_number_of_steps_are_sorted_by_their_last_rate(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     drawn: list[Figure] = []

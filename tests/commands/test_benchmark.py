@@ -106,13 +106,15 @@ def test_an_update_of_a_preset_is_timed(ithor, tmp_path):
     assert row["steps_per_second"] > 0
 
 
-def test_rows_say_context_only_of_models_that_have_it(ithor, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("preset", "units"), [("paper-inputs", 64), ("default", 0)])
+def test_rows_say_context_only_of_models_that_have_it(preset, units, ithor, tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark, "model_rows", lambda *asked: [{"part": "rollout"}])
     out = tmp_path / "figures.jsonl"
-    flags = ["--parts", "rollout", "--preset", "paper-inputs", "--models", "tdanet", "ssnet"]
+    flags = ["--parts", "rollout", "--preset", preset, "--models", "tdanet", "ssnet"]
     benchmark.main([*flags, "--out", str(out)])
     rows = [json.loads(line) for line in out.read_text().splitlines()][1:]
-    assert [(row["model"], row.get("context")) for row in rows] == [("tdanet", 64), ("ssnet", None)]
+    said = [(row["model"], row.get("context")) for row in rows]
+    assert said == [("tdanet", units), ("ssnet", None)]
 
 
 def test_a_model_that_cannot_triangulate_is_one_line(ithor, tmp_path, capsys):
