@@ -103,7 +103,7 @@ def training_curves(
     ]
     figure = Figure(figsize=(14, 0.5 + sum(heights)), layout="constrained")
     panels = figure.subplots(len(budgets), 3, height_ratios=heights, squeeze=False)
-    for (*axes, beside), millions in zip(panels, sorted(budgets), strict=True):
+    for (*axes, legend_axis), millions in zip(panels, sorted(budgets), strict=True):
         members = sorted(budgets[millions], key=lambda member: -member[0])
         for index, (axis, measure) in enumerate(zip(axes, MEASURES, strict=True)):
             for (*_, lines), (color, dashes) in zip(members, _line_styles(), strict=False):
@@ -115,8 +115,8 @@ def training_curves(
             axis.spines[["top", "right"]].set_visible(False)
         axes[0].set_title(f"{millions:g} M steps", loc="left", fontsize=10)
         names = [listed for _, listed, _ in members]
-        beside.set_axis_off()
-        beside.legend(axes[0].lines, names, loc="center left", fontsize=8, frameon=False)
+        legend_axis.set_axis_off()
+        legend_axis.legend(axes[0].lines, names, loc="center left", fontsize=8, frameon=False)
     figure.suptitle(_in_lines(title))
     drawing.save(figure, path, DPI, comment)
 

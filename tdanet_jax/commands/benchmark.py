@@ -264,9 +264,8 @@ def measure(command: Command, mesh: Mesh) -> Iterator[Row]:
     for name in command.models if {*TRAINED, "decision"} & {*command.parts} else ():
         config = command.config(name)
         settings = command.settings(config)
-        with_context = dataclasses.replace(config.network, context=1)
-        asked = dataclasses.replace(config, network=with_context)
-        if "--context" in unused_flags(asked, task.classes):
+        with_context = dataclasses.replace(command, context=1).config(name)
+        if "--context" in unused_flags(with_context, task.classes):
             del settings["context"]
         for row in model_rows(command, name, peak):
             yield {"part": row.pop("part"), **settings, **row}

@@ -35,8 +35,8 @@ def test_training_curves_have_room_for_many_agents_and_long_names(
     figures.training_curves([(name, rows) for name in names], "Split", tmp_path / "a.png")
     [figure] = drawn
     figure.draw_without_rendering()
-    left, _, beside = figure.axes
-    box = beside.get_legend().get_window_extent()
+    left, _, legend_axis = figure.axes
+    box = legend_axis.get_legend().get_window_extent()
     assert left.get_window_extent().x1 < box.x0 < box.x1 <= figure.bbox.width
     assert 0 <= box.y0 < box.y1 <= figure.bbox.height
     assert left.get_window_extent().height > 1.5 * figure.dpi
@@ -76,8 +76,8 @@ def test_agents_with_the_same_number_of_steps_are_sorted_by_their_last_rate(
         for name, rate in rates.items()
     ]
     figures.training_curves(runs, "Split", tmp_path / "a.png")
-    left, _, beside = drawn[0].axes
-    assert [text.get_text() for text in beside.get_legend().get_texts()] == ["b", "c", "a"]
+    left, _, legend_axis = drawn[0].axes
+    assert [text.get_text() for text in legend_axis.get_legend().get_texts()] == ["b", "c", "a"]
     assert [line.get_ydata()[-1] for line in left.lines] == [75, 50, 25]
-    colors = [line.get_color() for line in beside.get_legend().get_lines()]
+    colors = [line.get_color() for line in legend_axis.get_legend().get_lines()]
     assert colors == [line.get_color() for line in left.lines]

@@ -13,8 +13,10 @@ NOTEBOOK = Path(__file__).parents[2] / "notebooks" / "analysis.ipynb"
 
 @pytest.mark.slow
 def test_it_runs(opinionated_run, tmp_path):
-    nbclient = pytest.importorskip("nbclient", reason="needs the extra `analysis`")
-    nbformat = pytest.importorskip("nbformat", reason="needs the extra `analysis`")
+    reason = "needs the extra `analysis`"
+    nbclient = pytest.importorskip("nbclient", reason=reason)
+    nbformat = pytest.importorskip("nbformat", reason=reason)
+    pytest.importorskip("pandas", reason=reason)
 
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     first = next(cell for cell in notebook.cells if cell.cell_type == "code")
