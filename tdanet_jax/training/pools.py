@@ -24,6 +24,7 @@ class Pools:
     """The pools of rooms that a run trains in, or several seeds that train together.
 
     `count` pools take turns, numbered from 0. `params` is the environment of turn `entered`.
+    Observations begin with `first_rows` rows; later pools may need more.
     """
 
     def __init__(self, task: Task, config: TrainConfig, sharding: NamedSharding) -> None:
@@ -41,6 +42,7 @@ class Pools:
         if self.count > 1:
             first = first.padded(first, SPARE)
         self.entered = 0
+        self.first_rows = first.max_detections
         self.params: EnvParams = jax.device_put(first, sharding)
 
     @property

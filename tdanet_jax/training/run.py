@@ -41,7 +41,8 @@ class Run:
 
         Args:
           mesh: the devices that the environments are split over; by default the first alone.
-          pools: of another seed of the run, for seeds that train together.
+          pools: of another seed, for seeds that train together. A seed that has frames of another
+            length, because it is behind or ahead, has its own until all have come as far.
 
         Raises:
           ValueError: the checkpoint does not fit the configuration or the rooms.
@@ -84,14 +85,30 @@ class Run:
     def _init(self, key: jax.Array, words: jax.Array, params: EnvParams) -> TrainState:
         return learner.init(key, self.config.learner, self.model, words, params)
 
+    def share(self, pools: Pools) -> None:
+        """Trains in the pools of another seed from now on."""
+        if self.pools is not pools:
+            self.pools.close()
+        self.pools, self._closes_pools = pools, False
+
+    def _use_frames_of(self, rows: int) -> None:
+        """Makes frames so long; if those of shared pools differ, in pools of its own."""
+        if not self._closes_pools and self.pools.params.max_detections != rows:
+            self.pools = Pools(self.task, self.config, self._shared)
+            self._closes_pools = True
+        self.pools.lengthen_frames(rows)
+
     def _begin(self) -> TrainState:
+        self._use_frames_of(self.pools.first_rows)
         init = jax.jit(self._init, out_shardings=self._layout)
         return init(jax.random.key(self.config.seed), self._words, self.pools.params)
 
     def _restore(self) -> TrainState:
         def make_state(rows: int | None) -> TrainState:
-            more = max(rows or 0, self.pools.params.max_detections)
-            return self._init(jax.random.key(0), self._words, self.pools.params.with_rows(more))
+            params = self.pools.params
+            if rows is not None:
+                params = params.replace(max_detections=rows)  # which is all that shapes depend on
+            return self._init(jax.random.key(0), self._words, params)
 
         state, meta = self.checkpoints.restore(make_state)
         if meta["data_version"] != self.task.tables.data_version:
@@ -101,14 +118,14 @@ class Run:
             )
         if meta.get("variants") != self.task.variants_version:
             raise ValueError(
-                f"{self.folder}: trained in variants {meta.get('variants')}, "
+                f"{self.folder}: trained with the added rooms {meta.get('variants')}, "
                 f"these are {self.task.variants_version}"
             )
         self.seconds = float(meta["seconds"])
         self._saved = int(state.updates)
         # The last chunk was in these rooms. They are entered only if there is another.
         self._turn = self.pools.turn(max(0, self._saved - self.config.chunk_updates))
-        self.pools.lengthen_frames(int(meta.get("max_detections", 0)))
+        self._use_frames_of(int(meta.get("max_detections", self.pools.params.max_detections)))
         state = jax.device_put(state, self._layout)
         wrap = jax.jit(jax.random.wrap_key_data, out_shardings=self._shared)
         return state.replace(key=wrap(state.key))
@@ -334,6 +351,8 @@ def _chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
     for run in runs:
         for row in run.chunks(until=furthest):
             yield [row]
+    for run in runs[1:]:
+        run.share(runs[0].pools)
     if runs[0].progress >= 1.0:
         return
     config = runs[0].config
@@ -349,8 +368,6 @@ def _chunks_together(runs: Sequence[Run]) -> Iterator[list[Row]]:
 
     lead, stacked = runs[0], together()
     chunk = compiled_for = None
-    for run in runs:
-        run._open_journal()
     while lead.progress < 1.0:
         changed = [run._change_rooms() for run in runs]
         if any(changed):

@@ -400,23 +400,39 @@ def test_seeds_that_stop_stop_loading(task: Task, slow: threading.Event, tmp_pat
 
 
 @pytest.mark.slow
-def test_seeds_that_train_together_go_on_bit_for_bit(task: Task, tmp_path: Path) -> None:
-    """One of them was interrupted before a change of rooms, and the other after it."""
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_seeds_that_train_together_go_on_bit_for_bit(
+    ithor: SceneTables, tmp_path: Path, order: tuple[int, ...]
+) -> None:
+    """Seeds were saved after so many chunks, or are new: before a change of rooms and after it, or
+    (if the second pool has longer frames than the first) on both sides of it. One that catches up
+    alone runs another program, which rounds otherwise.
+    """
+    task = task_of(ithor, [], tuple(ROOMS[i] for i in order))
     whole = together(tmp_path / "whole", task)
     list(chunks_together(whole))
-    begun = together(tmp_path / "begun", task)
-    for count, _ in enumerate(chunks_together(begun), start=1):
-        if count in (4, 5):
-            begun[count - 4].save()
-        if count == 6:
-            break
-    begun = together(tmp_path / "begun", task)
-    widths = [len(rows) for rows in chunks_together(begun)]
-    assert widths == [1, 2, 2, 2]
-    for ours, theirs in zip(whole[1:], begun[1:], strict=True):
-        for one, other in zip(leaves(ours), leaves(theirs), strict=True):
+    longer = order[0] == 2
+    for saved in [(1, 3), (3, 1), (0, 3), (3, 0)] if longer else [(4, 5)]:
+        folder = tmp_path / f"{saved[0]}-{saved[1]}"
+        begun = together(folder, task)
+        for count, _ in enumerate(chunks_together(begun), start=1):
+            for run, at in zip(begun, saved, strict=True):
+                if count == at:
+                    run.save()
+            if count == 6:
+                break
+        begun = together(folder, task)
+        rows = [run.pools.params.max_detections for run in begun]
+        assert (rows[0] != rows[1]) == longer
+        assert (begun[0].pools is not begun[1].pools) == longer
+        widths = [len(rows) for rows in chunks_together(begun)]
+        assert widths == [1] * abs(saved[0] - saved[1]) + [2] * (8 - max(saved))
+        ahead = saved.index(max(saved))
+        for one, other in zip(leaves(whole[ahead]), leaves(begun[ahead]), strict=True):
             np.testing.assert_array_equal(one, other)
-    assert [run._turn for run in begun] == [3, 3]
+        assert [run._turn for run in begun] == [3, 3]
+        assert [run.steps for run in begun] == [TINY.steps] * 2
+        assert begun[0].pools is begun[1].pools
 
 
 def test_flags_of_pools_must_be_positive() -> None:

@@ -119,7 +119,7 @@ def test_a_run_goes_on_in_the_variants_that_it_began_in(whole, tmp_path):
     varied = dataclasses.replace(run.task, variants_version="abc")
     Run(tmp_path, run.config, varied).save()
     Run(tmp_path, run.config, varied)
-    with pytest.raises(ValueError, match="trained in variants abc, these are None"):
+    with pytest.raises(ValueError, match="trained with the added rooms abc, these are None"):
         Run(tmp_path, run.config, run.task)
 
 
