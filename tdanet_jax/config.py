@@ -29,9 +29,9 @@ BUDGETS = ("steps", "episodes", "minutes")
 CONFIG_FILE = "config.json"
 #: Name of the file in a run's folder that holds a copy of the vectors of --word-vectors.
 WORD_VECTORS_FILE = "word_vectors.npz"
-#: Variants of a room.
+#: Most variants of a room.
 MOST_VARIANTS = 400
-#: Generated rooms.
+#: Most generated rooms.
 MOST_GENERATED = 10_000
 #: Environment variable: comma-separated modules of custom models and sensors that a run's config
 #: may import.
@@ -199,8 +199,8 @@ class TrainConfig(Settings):
     (mjolnir-o that does so), or the dotted name of a custom module with a function `make`
     (docs/models.md)."""
     steps: int | None = None
-    """Budget in environment steps (actions). If several budgets are given, training stops when the
-    first runs out; if none is given, after 12,000,000 steps."""
+    """Budget in environment steps, B * T for each update. If several budgets are given, training
+    stops when the first runs out; if none is given, after 12,000,000 steps."""
     episodes: int | None = None
     """Budget in training episodes; the paper's is 6,000,000."""
     minutes: float | None = None
@@ -290,7 +290,7 @@ class TrainConfig(Settings):
             )
         self.network.spec.check()
 
-    def in_rooms_alone(self) -> TrainConfig:
+    def for_tests(self) -> TrainConfig:
         """The same without what is only for training: extra targets, variants, generated rooms."""
         return dataclasses.replace(
             self, extra_targets=None, variants=0, generated=0, generated_only=False
@@ -537,7 +537,8 @@ def from_json(values: Mapping[str, Any]) -> TrainConfig:
     """The configuration that `to_json` made these values from.
 
     Raises:
-      ValueError: a field is missing, unknown or out of range.
+      ValueError: `learner` or `network` is missing, or a field is unknown or out of range. Other
+        missing fields, of which files of earlier versions know nothing, have their defaults.
     """
     try:
         for name, value in {"config": values, "learner": values["learner"]}.items():

@@ -75,7 +75,10 @@ class EvalConfig(Settings):
 
     @property
     def departures(self) -> dict[str, Any]:
-        """The values, by name, for which this is not the official test; none if it is."""
+        """The values, by name, for which this is not the official test; none if it is.
+
+        Without rooms of one's own and their targets, which `report.Provenance` names.
+        """
         values = {name: getattr(self, name) for name in ("step_limit", "episodes")}
         values["training_rooms"] = self.training_rooms
         values |= {name: list(getattr(self, name)) for name in ("scenes", "targets")}
@@ -85,7 +88,8 @@ class EvalConfig(Settings):
         return {name: value for name, value in values.items() if value} | self.decisions.replaced
 
     def locate(self, config: TrainConfig, run: Path | str) -> TrainConfig:
-        """A run's configuration as it is evaluated, with its files and no rooms to train in alone.
+        """A run's configuration as it is evaluated: with its files, without rooms and targets that
+        are only for training.
 
         Args:
           config: the run's.
@@ -107,7 +111,7 @@ class EvalConfig(Settings):
                 )
         config = self.with_targets(dataclasses.replace(config, data=data))
         words = find_word_vectors(config, run, self.word_vectors)
-        config = with_decisions(config.in_rooms_alone(), self.decisions, run)
+        config = with_decisions(config.for_tests(), self.decisions, run)
         return dataclasses.replace(config, word_vectors=words)
 
     def with_targets(self, config: TrainConfig) -> TrainConfig:

@@ -184,7 +184,7 @@ def task_in(rooms: Rooms, config: TrainConfig, progress: Progress | None = None)
     config, features = resolve(dataclasses.replace(config, data=data)), None
     if rooms.path is not None and config.network.image == "features":
         features = load_features(rooms.path, rooms.tables)
-    with _naming(rooms.path):
+    with _naming_file(rooms.path):
         added: list[Part] = []
         for kind, count in ((variants, config.variants), (generated, config.generated)):
             if count:
@@ -197,7 +197,7 @@ def task_in(rooms: Rooms, config: TrainConfig, progress: Progress | None = None)
 
 
 @contextlib.contextmanager
-def _naming(path: Path | None) -> Iterator[None]:
+def _naming_file(path: Path | None) -> Iterator[None]:
     """Errors inside name the file of imported rooms."""
     try:
         yield
@@ -208,7 +208,7 @@ def _naming(path: Path | None) -> Iterator[None]:
 
 
 def _load_pool(rooms: Rooms, pool: Sequence[Part], progress: Progress) -> SceneTables:
-    with _naming(rooms.path):
+    with _naming_file(rooms.path):
         return pools.load(pool, rooms.tables.classes, progress)
 
 
@@ -218,7 +218,7 @@ def make_task(
     vectors: WordVectors,
     extras: Extras | None = None,
     features: np.ndarray | None = None,
-    varied: SceneTables | None = None,
+    added: SceneTables | None = None,
     further_pools: Sequence[Callable[[Progress], SceneTables]] = (),
 ) -> Task:
     """The task of a configuration in the given rooms; the split is limited to what they hold.
@@ -231,9 +231,9 @@ def make_task(
         replace those found in the training rooms. Hidden classes are in neither.
       features: [S, 512, 7, 7], ResNet-18's maps of all poses, for models that are shown an image.
         Images show hidden classes as well: nothing can be filtered out of them.
-      varied: variants of the training rooms and generated ones, to train in as well, or with
+      added: variants of the training rooms and generated ones, to train in as well, or with
         `generated_only` alone. Parents and class graph are those of the training rooms themselves.
-      further_pools: each gives further such rooms, which take turns with `varied`.
+      further_pools: each gives further such rooms, which take turns with `added`.
 
     Raises:
       ValueError: there are no rooms to train or to evaluate in, a target has no word vector, or the
@@ -261,11 +261,11 @@ def make_task(
         asked = {room: (*names, *extra.get(room, ())) for room, names in split.seen.items()}
         train_parents = _parents(train_rooms, asked, split.hidden, extras)
     trains = np.isin(np.array(tables.scenes), split.train_scenes)[tables.position_scene]  # [P]
-    if varied is not None:
+    if added is not None:
         if features is not None and model.encoder.maps:
             flag = "--variants" if config.variants else "--generated"
             raise ValueError(f"{flag}: there are no feature maps of these rooms")
-        varied = with_targets(varied, train_rooms.targets)
+        added = with_targets(added, train_rooms.targets)
     train_maps, eval_maps = _feature_maps(config.model, model, features, trains, tables.grid)
     hidden = frozenset((*split.hidden, *unnamed))
     trained = _TrainingRooms(
@@ -288,7 +288,7 @@ def make_task(
         split=split,
         classes=classes,
         model=model,
-        train_params=trained.params(varied),
+        train_params=trained.params(added),
         eval_params=make_params(
             tables,
             {room: split.seen[room] + split.unseen[room] for room in split.seen},
@@ -302,7 +302,7 @@ def make_task(
         words=jnp.asarray(words),
         vectors=vectors,
         extras=extras,
-        variants_version=None if varied is None else varied.data_version,
+        variants_version=None if added is None else added.data_version,
         further_pools=tuple(further(load) for load in further_pools),
     )
 

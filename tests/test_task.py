@@ -113,7 +113,7 @@ def test_classes_without_a_word_vector_are_hidden_with_one_warning(
     odd = renamed(rooms(ithor), Faucet="flux capacitor", Cabinet="zzqx", Pan="Lampstand")
     message = r"for zzqx \(zzqx\), flux capacitor \(.*capacitor\): agents do not see such objects"
     with pytest.warns(UserWarning, match=message) as said:
-        task = make_task(TrainConfig(network=SMALL), odd, glove, varied=odd)
+        task = make_task(TrainConfig(network=SMALL), odd, glove, added=odd)
     assert len(said) == 1
     hidden = [odd.classes.index(name) for name in ("flux capacitor", "zzqx")]
     known = odd.classes.index("Lampstand")  # its vector is that of "lamp stand"
@@ -139,7 +139,7 @@ def test_extra_targets_are_for_training_alone_and_half_of_it(
     varied = dataclasses.replace(varied, scenes=("FloorPlan7-v01",))
     split, classes = make_split("18/4"), np.array(tables.classes)
     plain, more = (
-        make_task(TrainConfig(network=SMALL, extra_targets=extra), tables, glove, varied=varied)
+        make_task(TrainConfig(network=SMALL, extra_targets=extra), tables, glove, added=varied)
         for extra in (None, "all")
     )
     chex.assert_trees_all_equal(plain.eval_params, more.eval_params)

@@ -125,7 +125,7 @@ def load_task(run: Path | str, rooms: Rooms, word_vectors: Path | str | None = N
 def _in_these_rooms(run: Path, config: TrainConfig, word_vectors: Path | str | None) -> TrainConfig:
     """A run's configuration for the rooms that it is shown in, with the right word vectors."""
     path = find_word_vectors(config, folder_of(run), word_vectors)
-    return dataclasses.replace(config.in_rooms_alone(), word_vectors=path)
+    return dataclasses.replace(config.for_tests(), word_vectors=path)
 
 
 @dataclasses.dataclass(frozen=True)

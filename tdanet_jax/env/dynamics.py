@@ -69,7 +69,8 @@ def start(
 
 
 def reset_state(key: jax.Array, params: EnvParams) -> EnvState:
-    """A random episode: room type, scene, target and start, each uniform given the one before.
+    """A random episode: room type, scene, target and start, each uniform given the one before. With
+    extra targets, those and the others each come about half of the time.
 
     Starts are uniform over the positions from which the target can be reached and over the
     rotations; the horizon is 0.
@@ -107,7 +108,9 @@ def reset(key: jax.Array, params: EnvParams) -> tuple[Observation, EnvState]:
 
 
 def observe(state: EnvState, params: EnvParams) -> Observation:
-    """The detections in view, padded to K rows."""
+    """What the agent is shown: the detections in view, padded to K rows, the target, and what its
+    sensors read.
+    """
     frame = _frame(state, params) if state.frame is None else state.frame
     features = None
     if params.features is not None and params.first_feature is not None:

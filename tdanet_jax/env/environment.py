@@ -37,7 +37,7 @@ class Environment:
         return NUM_ACTIONS
 
     def action_space(self, params: EnvParams | None = None) -> Discrete:
-        """The actions. Under `jit`, where nothing can be refused, any other one changes nothing."""
+        """The actions. Under `jit`, where none is refused, any other number is a step in place."""
         return Discrete(NUM_ACTIONS)
 
     def observation_space(self, params: EnvParams | None = None) -> Dict:

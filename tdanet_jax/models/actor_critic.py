@@ -41,7 +41,10 @@ class RecurrentState(struct.PyTreeNode):
     is_first: jax.Array  # [B] bool, the episode has just begun
 
     def restarted(self, done: jax.Array) -> RecurrentState:
-        """The state with a new episode in the environments that are `done` [B] bool."""
+        """The state with a new episode in the environments that are `done` [B] bool.
+
+        Their `carry` is still the old one: the next step is told `is_first` and starts from zeros.
+        """
         probs = jnp.where(done[:, None], 0.0, self.prev_action_probs)
         return self.replace(prev_action_probs=probs, is_first=done)
 

@@ -54,7 +54,7 @@ class TrainState(struct.PyTreeNode):
 
 
 class Rollout(NamedTuple):
-    """T steps of B environments; every field is [T, B, ...]."""
+    """T steps of B environments; every field but `activations` is [T, B, ...]."""
 
     obs: Observation
     prev_action_probs: jax.Array
@@ -412,7 +412,7 @@ def update(
 
 
 def _explained_variance(steps: Rollout, advantage: jax.Array) -> jax.Array:
-    """1 - Var(return - value) / Var(return) over the steps that count; NaN if returns are alike."""
+    """1 - Var(return - value) / Var(return) over the steps that count; not finite if that is 0."""
     counted = ~steps.bootstrap_only
     rest = jnp.var(advantage, where=counted)
     return 1.0 - rest / jnp.var(steps.value + advantage, where=counted)

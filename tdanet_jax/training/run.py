@@ -228,8 +228,8 @@ class Run:
     def _shares(self) -> jax.Array:
         """Fractions of the budget that are used before and after the next chunk.
 
-        Of steps it is known; episodes and minutes are extrapolated from the chunks so far. So the
-        state alone tells: a run that was stopped continues with the same schedule.
+        Exact for a budget in steps; extrapolated from the pace so far for episodes and minutes.
+        Either depends on the saved state alone, so a resumed run has the same schedule.
         """
         config, before = self.config, self.progress
         chunks_done = int(self.state.updates) / config.chunk_updates

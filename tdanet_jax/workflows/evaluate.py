@@ -16,7 +16,7 @@ from tdanet_jax.evaluation.policies import MakePolicy, Policy
 from tdanet_jax.evaluation.saved_networks import SavedNetwork
 from tdanet_jax.io import files
 from tdanet_jax.io.bundled_agents import find_run
-from tdanet_jax.task import ITHOR, environment, load_task
+from tdanet_jax.task import ALL_ROOMS, ITHOR, environment, load_task
 
 #: Policies that need no checkpoint.
 UNTRAINED: dict[str, Callable[[], Policy]] = {
@@ -63,7 +63,7 @@ def evaluate(
       ValueError: a folder holds no run, its network cannot be read, or the arguments do not go
         together.
     """
-    report.code_version()  # as it is now
+    report.code_version()  # now, and not at the end, when the checkout may be another
     folder = None if out is None else Path(out)
     if folder is not None:
         files.check_writable(folder)
@@ -127,6 +127,10 @@ def _evaluate_policy(
     chosen: dict[str, Any] = {name: path for name, path in files.items() if path is not None}
     config = test.with_targets(dataclasses.replace(config, **chosen))
     config.check()
+    if callable(policy):  # observations as long as in `task.make`, where there is one pool
+        config = dataclasses.replace(config, pool_rooms=ALL_ROOMS)
+    else:
+        config = config.for_tests()
     task, seed = load_task(config), config.seed if seed is None else seed
     params, lists = selection.select(task, test)
     params = selection.with_senses(task, params, [test.senses])[0]

@@ -253,7 +253,7 @@ def test_so_it_is_in_variants(rooms: SceneTables, glove: WordVectors) -> None:
     train = rooms.subset(name for name in make_split("18/4").train_scenes if name in rooms.scenes)
     varied = dataclasses.replace(train, scenes=tuple(f"{name}-v01" for name in train.scenes))
     params, same, other = (
-        make_task(config, rooms, glove, varied=tables).train_params
+        make_task(config, rooms, glove, added=tables).train_params
         for tables in (varied, perturbed(varied, hidden, 1), perturbed(varied, {"Mug"}, 1))
     )
     assert len(params.next_position) == 2 * len(train.position)

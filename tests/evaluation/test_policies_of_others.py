@@ -51,6 +51,27 @@ def crowded_training_rooms(config: TrainConfig, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(evaluate, "load_task", load)
 
 
+@pytest.mark.parametrize("custom", [True, False])
+def test_added_rooms_are_in_one_pool_as_in_make_or_left_out(
+    monkeypatch: pytest.MonkeyPatch, custom: bool
+) -> None:
+    """Vectors of a policy trained in `make`'s rooms are as long here; others heed no such rooms."""
+    loaded: list[TrainConfig] = []
+
+    def load(config: TrainConfig) -> Task:
+        loaded.append(config)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluate, "load_task", load)
+    asked = TrainConfig(generated=40, variants=3, pool_rooms=10, extra_targets="Pan")
+    policy: Any = (lambda env: None) if custom else "random"
+    with pytest.raises(KeyboardInterrupt):
+        tdanet_jax.evaluate(policy=policy, config=asked)
+    assert (loaded[0].generated, loaded[0].variants) == ((40, 3) if custom else (0, 0))
+    assert (loaded[0].pool_rooms > 10_000) == custom
+    assert (loaded[0].extra_targets is None) != custom
+
+
 def says_done(flat: FlatObservations, vector: Any) -> Any:
     """1 where the target's word is that of a row in view, else 0: for one vector."""
     width = flat.env.words.shape[1]

@@ -67,7 +67,7 @@ def task_of(
         lambda progress, n=n, tables=tables: further(n, tables, progress)
         for n, tables in enumerate(others, start=1)
     ]
-    return make_task(TINY, ithor, words.load_bundled(), varied=first, further_pools=loads)
+    return make_task(TINY, ithor, words.load_bundled(), added=first, further_pools=loads)
 
 
 #: A run, its turns, the room types it was in, what was loaded, and after how many steps all of its
