@@ -114,17 +114,21 @@ def of_agents(rows: Iterable[Row]) -> list[str]:
     flags = [seeds[0].flags for seeds in agents.values()]
     common = [flag for flag in flags[0] if all(flag in own for own in flags)]
     shared = len(agents) > 1 and len(common) > 1
+    one_model = shared and not common[0].startswith("--")
     shown = []
     for own, seeds in zip(flags, agents.values(), strict=True):
         rest = [flag for flag in own if flag not in common]
         name, _, *cells = _of_agent(seeds)
-        if shared:
+        if one_model:
             name = _code(" ".join(rest)) if rest else "as it is"
+        elif shared:
+            name = _named(rest)
         shown.append(((name, *cells), comparison.summary([row.results for row in seeds])))
     table = comparison.table(
         (_HEADS[0], *_HEADS[2:]), shown, buckets=("L>=1",), measures=comparison.MEASURES
     )
-    said = [f"Each is {_named(common)} with what its row says.", ""] if shared else []
+    what = f"is {_named(common)} with" if one_model else f"has {_code(' '.join(common))} and"
+    said = [f"Each {what} what its row says.", ""] if shared else []
     return ["", *said, *table, ""]
 
 

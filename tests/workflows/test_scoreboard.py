@@ -350,6 +350,13 @@ def test_a_table_of_agents_gives_the_flags_that_all_share_once() -> None:
         "| <code>--targets Mug,Bed --generated 10</code>",
     ]  # fmt: skip
     assert [line.split(" |")[1] for line in lines[2:-1]] == [" 0", " 0, 0", " 0"]
+    models = [dataclasses.replace(config, model="sp") for config in configs[:1]] + configs[1:2]
+    rows_of_models = [dataclasses.replace(first, config=config) for config in models]
+    _, said, _, *lines = scoreboard_page.of_agents(rows_of_models)
+    assert said == "Each has <code>--preset best --steps 9</code> and what its row says."
+    assert [line.split(" |")[0] for line in lines[2:-1]] == [
+        "| sp <code>--variants 4</code>", "| tdanet"
+    ]  # fmt: skip
     _, *alone = scoreboard_page.of_agents(rows[:1])
     assert alone[2].startswith("| tdanet <code>--preset best --steps 9 --variants 4</code> | 0 |")
     random = scoreboard.read(RESULTS / "18-4-random")
