@@ -77,7 +77,7 @@ class EvalConfig(Settings):
     def departures(self) -> dict[str, Any]:
         """The values, by name, for which this is not the official test; none if it is.
 
-        Without rooms of one's own and their targets, which `report.Provenance` names.
+        Custom rooms and targets are not among them: `report.Provenance` records those.
         """
         values = {name: getattr(self, name) for name in ("step_limit", "episodes")}
         values["training_rooms"] = self.training_rooms

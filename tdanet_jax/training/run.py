@@ -41,8 +41,8 @@ class Run:
 
         Args:
           mesh: the devices that the environments are split over; by default the first alone.
-          pools: of another seed, for seeds that train together. A seed that has frames of another
-            length, because it is behind or ahead, has its own until all have come as far.
+          pools: those of another seed, if seeds train together. If this seed's checkpoint has
+            another number of rows per frame, it uses its own pools until all are equally far.
 
         Raises:
           ValueError: the checkpoint does not fit the configuration or the rooms.
